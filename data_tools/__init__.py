@@ -1,0 +1,1 @@
+"""Captures in: synthesize from animated glTF, import from other tools."""

@@ -1,0 +1,18 @@
+"""Motion capture without markers and without a body model, from the geometry alone.
+
+Data flows one way: capture → geometry → segmentation → skeleton → files and pictures.
+"""
+
+from importlib.metadata import PackageNotFoundError, version
+
+import numba
+
+# Frames are mapped over threads that each call parallel kernels: of Numba's layers only OpenMP allows that.
+numba.config.THREADING_LAYER = "omp"  # type: ignore[attr-defined]
+
+try:
+    __version__ = version("geomocap")
+except PackageNotFoundError:  # a source tree that was never installed
+    __version__ = "0+unknown"
+
+__all__ = ["__version__"]

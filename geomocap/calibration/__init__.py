@@ -1,0 +1,1 @@
+"""Reference-bar calibration and the calibrations of other tools."""

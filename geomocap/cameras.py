@@ -1,0 +1,259 @@
+"""A rig: named, calibrated, static cameras, as pycolmap cameras and world-to-camera poses.
+
+Pixels are COLMAP's everywhere: the centre of the top-left pixel is (0.5, 0.5). An array index is a coordinate
+minus 0.5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from geomocap.errors import CalibrationError
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Named cameras with their poses.
+
+    Attributes
+    ----------
+    names : tuple of C str
+        Camera names, as the folders of the capture.
+    cameras : tuple of C pycolmap.Camera
+        Interior orientations (any COLMAP model), pixels.
+    cam_from_world : (C, 3, 4) float
+        Exterior orientations [R | t], metres: x_cam = R x_world + t; x right, y down, z forward.
+    """
+
+    names: tuple[str, ...]
+    cameras: tuple[pycolmap.Camera, ...]
+    cam_from_world: np.ndarray
+
+    def __post_init__(self) -> None:
+        pose = np.ascontiguousarray(self.cam_from_world, dtype=np.float64)
+        if len(set(self.names)) != len(self.names):
+            raise CalibrationError(f"camera names must be unique, got {', '.join(self.names)}")
+        if len(self.cameras) != len(self.names) or pose.shape != (len(self.names), 3, 4):
+            raise CalibrationError(
+                f"{len(self.names)} camera names, {len(self.cameras)} cameras and poses of shape {pose.shape}: "
+                "expected one camera and one 3×4 pose a name"
+            )
+        R = pose[:, :, :3]
+        error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+        for name, e, det in zip(self.names, error, np.linalg.det(R), strict=True):
+            if not np.isfinite(e) or e > 1e-6:
+                raise CalibrationError(f"camera {name}: its rotation is not orthonormal (off by {e:.2g})")
+            if det < 0:
+                raise CalibrationError(f"camera {name}: its rotation mirrors the world (determinant {det:.3f})")
+        pose.flags.writeable = False
+        object.__setattr__(self, "cam_from_world", pose)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getstate__(self) -> dict:
+        return {
+            "names": self.names,
+            "cameras": [camera.todict() for camera in self.cameras],
+            "cam_from_world": np.array(self.cam_from_world),
+        }
+
+    def __setstate__(self, state: dict) -> None:
+        cameras = tuple(pycolmap.Camera(c) for c in state["cameras"])
+        object.__setattr__(self, "names", state["names"])
+        object.__setattr__(self, "cameras", cameras)
+        object.__setattr__(self, "cam_from_world", state["cam_from_world"])
+
+    # --- reading and writing ---
+
+    @classmethod
+    def read(cls, sparse: Path, names: Sequence[str] | None = None) -> Rig:
+        """Read a COLMAP model whose image names begin with the camera's name (`<camera>/<anything>`).
+
+        Parameters
+        ----------
+        sparse : Path
+            Folder of a COLMAP model, text or binary.
+        names : sequence of str, optional
+            The cameras wanted, in this order; all of them, sorted by name, if not given.
+
+        Raises
+        ------
+        CalibrationError
+            If the folder holds no model, or a camera has no posed image, or two images disagree about its pose.
+        """
+        try:
+            model = pycolmap.Reconstruction(str(sparse))
+        except Exception as error:
+            raise CalibrationError(f"{sparse}: no readable COLMAP model ({_first_line(error)})") from None
+        found: dict[str, tuple[pycolmap.Camera, np.ndarray]] = {}
+        for image in sorted(model.images.values(), key=lambda i: i.name):
+            if not image.has_pose:
+                continue
+            name = image.name.split("/")[0] if "/" in image.name else Path(image.name).stem
+            pose = image.cam_from_world().matrix()
+            if name in found and not np.allclose(found[name][1], pose, atol=1e-9):
+                raise CalibrationError(
+                    f"{sparse}: images of camera {name} have different poses, but cameras must not move; "
+                    f"keep one image {name}/<anything>"
+                )
+            found.setdefault(name, (model.cameras[image.camera_id], pose))
+        wanted = tuple(sorted(found)) if names is None else tuple(names)
+        for name in wanted:
+            if name not in found:
+                raise CalibrationError(
+                    f"{sparse}: no posed image of camera {name}; the model has {', '.join(sorted(found)) or 'none'}"
+                )
+        return cls(
+            wanted,
+            tuple(found[n][0] for n in wanted),
+            np.array([found[n][1] for n in wanted]).reshape(-1, 3, 4),
+        )
+
+    def reconstruction(self) -> pycolmap.Reconstruction:
+        """Return the rig as a COLMAP model with one image `<camera>/000000.png` a camera and no points."""
+        model = pycolmap.Reconstruction()
+        for i, (name, camera, pose) in enumerate(zip(self.names, self.cameras, self.cam_from_world, strict=True)):
+            copy = pycolmap.Camera(camera.todict())
+            copy.camera_id = i + 1
+            model.add_camera_with_trivial_rig(copy)
+            image = pycolmap.Image(name=f"{name}/000000.png", camera_id=i + 1, image_id=i + 1)
+            rotation = pycolmap.Rotation3d(np.array(pose[:, :3]))
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(rotation, np.array(pose[:, 3])))
+        return model
+
+    def write(self, sparse: Path) -> None:
+        """Write the rig as a COLMAP text model into the folder `sparse`, which is made if need be."""
+        sparse.mkdir(parents=True, exist_ok=True)
+        self.reconstruction().write_text(str(sparse))
+
+    # --- values ---
+
+    def select(self, names: Iterable[str]) -> Rig:
+        """Return the rig of these cameras only, in this order."""
+        index = [self.names.index(n) for n in names]
+        return Rig(
+            tuple(self.names[i] for i in index),
+            tuple(self.cameras[i] for i in index),
+            self.cam_from_world[index],
+        )
+
+    @property
+    def centers(self) -> np.ndarray:
+        """Projection centres, (C, 3) float, metres, world."""
+        R, t = self.cam_from_world[:, :, :3], self.cam_from_world[:, :, 3]
+        return -np.einsum("cji,cj->ci", R, t)
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """Image sizes, (C, 2) int: width, height in pixels."""
+        return np.array([(c.width, c.height) for c in self.cameras], dtype=np.int64).reshape(-1, 2)
+
+    @property
+    def viewing_directions(self) -> np.ndarray:
+        """Unit viewing directions, (C, 3) float, world."""
+        return np.array(self.cam_from_world[:, 2, :3])
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether no camera has distortion, so that `projections` describes it fully."""
+        return all(c.is_undistorted() for c in self.cameras)
+
+    @property
+    def projections(self) -> np.ndarray:
+        """Projection matrices K [R | t] without distortion, (C, 3, 4) float, world metres to COLMAP pixels."""
+        K = np.array([c.calibration_matrix() for c in self.cameras])
+        return K @ self.cam_from_world
+
+    def to_camera(self, points: np.ndarray) -> np.ndarray:
+        """Transform points (N, 3), metres, world, into all cameras: (C, N, 3) float."""
+        R, t = self.cam_from_world[:, :, :3], self.cam_from_world[:, :, 3]
+        return np.einsum("cij,nj->cni", R, points) + t[:, None]
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Project points (N, 3), metres, world, into all cameras, distortion included.
+
+        Returns
+        -------
+        pixels : (C, N, 2) float
+            COLMAP pixels; NaN for points behind a camera. Points outside the image are not cut off.
+        """
+        in_camera = self.to_camera(np.asarray(points, dtype=np.float64))
+        pixels = np.full((*in_camera.shape[:2], 2), np.nan)
+        for c, camera in enumerate(self.cameras):
+            front = in_camera[c, :, 2] > 1e-9
+            if front.any():
+                pixels[c, front] = camera.img_from_cam(in_camera[c, front])
+        return pixels
+
+    def rays(self, camera: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Cast viewing rays through pixels (N, 2) of one camera, distortion removed.
+
+        Returns
+        -------
+        origin : (3,) float, metres, world
+        directions : (N, 3) float, world, unit length
+        """
+        normalized = self.cameras[camera].cam_from_img(np.asarray(pixels, dtype=np.float64))
+        in_camera = np.column_stack([normalized, np.ones(len(normalized))])
+        in_camera /= np.linalg.norm(in_camera, axis=1, keepdims=True)
+        return self.centers[camera], in_camera @ self.cam_from_world[camera, :, :3]
+
+    def undistorted(self) -> Rig:
+        """Return the rig of pinhole cameras that see at least all that the real cameras see.
+
+        Same poses and camera constants; size and principal point are moved so that every original pixel falls
+        inside (bounded to four times the original area against runaway polynomials). `undistortion_maps` says where
+        the pixels come from.
+        """
+        cameras = []
+        for camera in self.cameras:
+            w, h = camera.width, camera.height
+            fx, fy = camera.focal_length_x, camera.focal_length_y
+            if camera.is_undistorted():
+                K = camera.calibration_matrix()
+                params = [fx, fy, K[0, 2], K[1, 2]]
+                cameras.append(pycolmap.Camera(model="PINHOLE", width=w, height=h, params=params))
+                continue
+            u, v = np.linspace(0, w, 65), np.linspace(0, h, 65)
+            border = np.concatenate(
+                [
+                    np.column_stack([u, np.zeros(65)]),
+                    np.column_stack([u, np.full(65, h)]),
+                    np.column_stack([np.zeros(65), v]),
+                    np.column_stack([np.full(65, w), v]),
+                ]
+            )
+            n = camera.cam_from_img(border) * [fx, fy]
+            center = np.array([camera.principal_point_x, camera.principal_point_y])
+            low = np.maximum(np.nanmin(n + center, axis=0), [-w / 2, -h / 2])
+            high = np.minimum(np.nanmax(n + center, axis=0), [1.5 * w, 1.5 * h])
+            low, high = np.floor(np.minimum(low, 0)), np.ceil(np.maximum(high, [w, h]))
+            size = (high - low).astype(int)
+            params = [fx, fy, *(center - low)]
+            cameras.append(pycolmap.Camera(model="PINHOLE", width=int(size[0]), height=int(size[1]), params=params))
+        return Rig(self.names, tuple(cameras), np.array(self.cam_from_world))
+
+    def undistortion_map(self, camera: int) -> tuple[np.ndarray, np.ndarray]:
+        """Say where each pixel of the undistorted image comes from, as `cv2.remap` wants it.
+
+        Returns
+        -------
+        map_x, map_y : (H', W') float32
+            Array indices (coordinate minus 0.5) into the original image, H' × W' the size of `undistorted()`.
+        """
+        target = self.undistorted().cameras[camera]
+        x, y = np.meshgrid(np.arange(target.width) + 0.5, np.arange(target.height) + 0.5)
+        normalized = np.asarray(target.cam_from_img(np.column_stack([x.ravel(), y.ravel()])))
+        source = self.cameras[camera].img_from_cam(np.column_stack([normalized, np.ones(len(normalized))]))
+        source = np.nan_to_num(source.astype(np.float32) - np.float32(0.5), nan=-1e6)
+        return source[:, 0].reshape(x.shape), source[:, 1].reshape(x.shape)
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

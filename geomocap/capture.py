@@ -1,0 +1,335 @@
+"""A capture: the folder of synchronized images or videos that everything starts from, read lazily.
+
+capture.toml                     name, fps, length_unit, up; optional: cameras, template_camera, region_of_interest
+images/<camera>/000000.png       or videos/<camera>.mp4
+background/<camera>.png          optional
+masks/<camera>/000000.png        optional, used as they are
+sparse/                          calibration, a COLMAP model
+bar/<camera>/000000.png          optional reference-bar recording
+"""
+
+from __future__ import annotations
+
+import threading
+import tomllib
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Literal, Protocol
+
+import av
+import cv2
+import numpy as np
+import tomli_w
+from pydantic import Field, ValidationError
+
+from geomocap.cameras import Rig
+from geomocap.errors import CaptureError
+from geomocap.files import fingerprint, write_text
+from geomocap.settings import Settings
+
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
+VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+
+
+class CaptureInfo(Settings):
+    """What `capture.toml` says."""
+
+    name: str = Field("capture", description="name of the recording")
+    fps: float = Field(gt=0, description="frames per second")
+    length_unit: Literal["m"] = Field("m", description="unit of the calibration")
+    up: Literal["x", "y", "z"] = Field("z", description="world axis that points up")
+    cameras: tuple[str, ...] | None = Field(None, description="the cameras to use, in this order; all if not given")
+    template_camera: str | None = Field(None, description="camera whose images are the templates of matching")
+    region_of_interest: tuple[tuple[float, float, float], tuple[float, float, float]] | None = Field(
+        None, description="corners (min, max) of the working volume, metres, world"
+    )
+
+
+class FrameSource(Protocol):
+    """Frames of one camera, in order, readable in any order."""
+
+    def __len__(self) -> int: ...
+
+    def read(self, frame: int) -> np.ndarray:
+        """Return frame `frame` as (H, W, 3) uint8, RGB."""
+        ...
+
+
+def read_image(path: Path, *, gray: bool = False) -> np.ndarray:
+    """Read an image file as (H, W, 3) uint8 RGB, or (H, W) uint8 if `gray`.
+
+    Raises
+    ------
+    CaptureError
+        If the file is missing, truncated or no image.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CaptureError(f"{path}: can't be read ({error.strerror}); every camera needs every frame") from None
+    whole = not (
+        (data[:8] == b"\x89PNG\r\n\x1a\n" and b"IEND" not in data[-64:])
+        or (data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-4096:])
+    )
+    if whole and data:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR_RGB)
+        if image is not None:
+            return image
+    raise CaptureError(f"{path}: truncated or no image ({len(data)} bytes); write it again")
+
+
+@dataclass(frozen=True)
+class ImageFolder:
+    """Frames of one camera as numbered image files."""
+
+    files: tuple[Path, ...]
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def read(self, frame: int) -> np.ndarray:
+        """Return frame `frame` as (H, W, 3) uint8, RGB."""
+        return read_image(self.files[frame])
+
+
+@dataclass
+class Video:
+    """Frames of one camera in a video file, decoded one by one and never unpacked to disk.
+
+    Reading forwards is cheap; reading elsewhere seeks to the key frame before. May be shared by threads.
+    """
+
+    path: Path
+    kept: int = 8
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+    _container: av.container.InputContainer | None = field(default=None, repr=False)
+    _frames: object = field(default=None, repr=False)
+    _next: int = field(default=0, repr=False)
+    _recent: OrderedDict[int, np.ndarray] = field(default_factory=OrderedDict, repr=False)
+
+    def __getstate__(self) -> dict:
+        return {"path": self.path, "kept": self.kept}
+
+    def __setstate__(self, state: dict) -> None:
+        self.__init__(**state)  # type: ignore[misc]
+
+    @cached_property
+    def _times(self) -> tuple[int, ...]:
+        """Presentation times of all frames, from the packets alone (nothing is decoded)."""
+        try:
+            with av.open(str(self.path)) as container:
+                stream = container.streams.video[0]
+                times = sorted(p.pts for p in container.demux(stream) if p.pts is not None and not p.is_discard)
+        except (av.FFmpegError, IndexError, OSError) as error:
+            raise CaptureError(f"{self.path}: no readable video ({error}); record or copy it again") from None
+        if not times:
+            raise CaptureError(f"{self.path}: holds no video frames; record or copy it again")
+        return tuple(times)
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def read(self, frame: int) -> np.ndarray:
+        """Return frame `frame` as (H, W, 3) uint8, RGB."""
+        with self._lock:
+            if frame not in self._recent:
+                try:
+                    self._decode_to(frame)
+                except (av.FFmpegError, StopIteration) as error:
+                    reason = str(error) or "it ends early"
+                    raise CaptureError(
+                        f"{self.path}: frame {frame} of {len(self)} can't be decoded ({reason}); copy the file again"
+                    ) from None
+            return self._recent[frame]
+
+    def _decode_to(self, frame: int) -> None:
+        times = self._times
+        if self._container is None or not self._next <= frame <= self._next + 64:
+            if self._container is not None:
+                self._container.close()
+            self._container = av.open(str(self.path))
+            stream = self._container.streams.video[0]
+            stream.thread_type = "SLICE"  # frame threads would hand out frames late after a seek
+            if frame > 0:
+                self._container.seek(times[frame], stream=stream, backward=True)
+            self._frames = self._container.decode(stream)
+        while True:
+            picture = next(self._frames)  # type: ignore[call-overload]
+            if picture.pts is None or picture.is_corrupt:
+                raise CaptureError(f"{self.path}: damaged near frame {frame} of {len(self)}; copy the file again")
+            index = int(np.searchsorted(times, picture.pts))
+            self._next = index + 1
+            if index >= frame - self.kept // 2:
+                self._recent[index] = picture.to_ndarray(format="rgb24")
+                while len(self._recent) > self.kept:
+                    self._recent.popitem(last=False)
+            if index >= frame:
+                if index > frame:
+                    raise CaptureError(f"{self.path}: frame {frame} is missing from the stream; copy the file again")
+                return
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A capture folder, checked when it is opened; images are read when they are asked for.
+
+    Attributes
+    ----------
+    path : Path
+    info : CaptureInfo
+    cameras : tuple of str
+        Camera names in the order used everywhere.
+    sources : dict of str to FrameSource
+    """
+
+    path: Path
+    info: CaptureInfo
+    cameras: tuple[str, ...]
+    sources: dict[str, FrameSource]
+
+    @classmethod
+    def open(cls, path: Path) -> Capture:
+        """Open and check a capture folder.
+
+        Raises
+        ------
+        CaptureError
+            If it isn't one: no capture.toml, a camera folder missing, frame counts that differ.
+        """
+        path = Path(path)
+        if not path.is_dir():
+            raise CaptureError(f"{path}: no such capture folder")
+        info = read_capture_info(path)
+        found = _find_sources(path)
+        if not found:
+            raise CaptureError(f"{path}: holds neither images/<camera>/*.png nor videos/<camera>.mp4")
+        names = info.cameras or tuple(sorted(found))
+        for name in names:
+            if name not in found:
+                raise CaptureError(
+                    f"{path}: camera {name} of capture.toml has no folder images/{name} and no video videos/{name}.mp4"
+                )
+        counts = {n: len(found[n]) for n in names}
+        if len(set(counts.values())) > 1:
+            listed = ", ".join(f"{n}: {c}" for n, c in counts.items())
+            raise CaptureError(
+                f"{path}: cameras have unequal numbers of frames ({listed}); cut them to the same frames"
+            )
+        return cls(path, info, names, {n: found[n] for n in names})
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return self.info.fps
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames, the same for all cameras."""
+        return len(self.sources[self.cameras[0]])
+
+    def frame(self, camera: str, frame: int) -> np.ndarray:
+        """Read one image: (H, W, 3) uint8, RGB."""
+        return self.sources[camera].read(frame)
+
+    def has_background(self, camera: str) -> bool:
+        """Whether the capture brings an empty background picture of this camera."""
+        return self._background_file(camera) is not None
+
+    def background(self, camera: str) -> np.ndarray:
+        """Read the empty background picture of a camera: (H, W, 3) uint8, RGB."""
+        file = self._background_file(camera)
+        if file is None:
+            raise CaptureError(f"{self.path}: no background/{camera}.png")
+        return read_image(file)
+
+    def _background_file(self, camera: str) -> Path | None:
+        files = [self.path / "background" / f"{camera}{e}" for e in IMAGE_ENDINGS]
+        return next((f for f in files if f.is_file()), None)
+
+    @property
+    def has_masks(self) -> bool:
+        """Whether the capture brings its own silhouettes."""
+        return (self.path / "masks").is_dir()
+
+    def mask(self, camera: str, frame: int) -> np.ndarray:
+        """Read a given silhouette: (H, W) uint8, 0 or 255."""
+        return np.where(read_image(self.path / "masks" / camera / f"{frame:06d}.png", gray=True) > 127, 255, 0).astype(
+            np.uint8
+        )
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether the capture holds a calibration."""
+        return (self.path / "sparse").is_dir()
+
+    @cached_property
+    def rig(self) -> Rig:
+        """The calibrated cameras, in the capture's order.
+
+        Raises
+        ------
+        CalibrationError
+            If there is no calibration, or one without all the cameras.
+        CaptureError
+            If an image's size is not the one that the camera is calibrated for.
+        """
+        if not self.is_calibrated:
+            raise CaptureError(f"{self.path}: not calibrated, no folder sparse/; run `geomocap calibrate {self.path}`")
+        rig = Rig.read(self.path / "sparse", self.cameras)
+        for name, (w, h) in zip(rig.names, rig.sizes, strict=True):
+            height, width = self.frame(name, 0).shape[:2]
+            if (width, height) != (w, h):
+                raise CaptureError(
+                    f"{self.path}: images of camera {name} are {width}×{height}, but it is calibrated for {w}×{h}; "
+                    "calibrate again, or import with the tool that made the calibration"
+                )
+        return rig
+
+    def fingerprint(self, *parts: str) -> str:
+        """Digest of the names, sizes and times of the files of these parts ("images", "masks", "sparse" …)."""
+        return fingerprint([self.path / "capture.toml", *(self.path / p for p in parts)])
+
+
+def read_capture_info(path: Path) -> CaptureInfo:
+    """Read and check `capture.toml` of a capture folder."""
+    file = path / "capture.toml"
+    try:
+        return CaptureInfo(**tomllib.loads(file.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise CaptureError(
+            f"{file}: can't be read ({error.strerror}); a capture needs at least `fps = …` in it"
+        ) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CaptureError(f"{file}: not valid TOML ({error})") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(p) for p in first["loc"])
+        raise CaptureError(f"{file}: {key}: {first['msg']}; see README, section Captures") from None
+
+
+def write_capture_info(path: Path, info: CaptureInfo) -> None:
+    """Write `capture.toml` of a capture folder."""
+    write_text(path / "capture.toml", tomli_w.dumps(info.model_dump(exclude_none=True)))
+
+
+def _find_sources(path: Path) -> dict[str, FrameSource]:
+    sources: dict[str, FrameSource] = {}
+    root = path.resolve()
+    for folder in sorted(p for p in (path / "images").glob("*") if p.is_dir()):
+        files = tuple(sorted(f for f in folder.iterdir() if f.suffix.lower() in IMAGE_ENDINGS))
+        for k, file in enumerate(files):
+            if file.stem != f"{k:06d}":
+                raise CaptureError(f"{file}: expected frame {k:06d} here; frames count from 000000 without gaps")
+        if not files:
+            raise CaptureError(f"{folder}: holds no frames (000000.png …)")
+        sources[folder.name] = ImageFolder(files)
+    for file in sorted((path / "videos").glob("*")):
+        if file.suffix.lower() in VIDEO_ENDINGS and file.stem not in sources:
+            sources[file.stem] = Video(file)
+    for name, source in sources.items():
+        first = source.files[0] if isinstance(source, ImageFolder) else source.path  # type: ignore[attr-defined]
+        if not first.resolve().is_relative_to(root):
+            raise CaptureError(f"{first}: leads out of the capture folder; copy the files of camera {name} into it")
+    return sources

@@ -1,0 +1,1 @@
+"""Space carving: silhouettes to surface voxels."""

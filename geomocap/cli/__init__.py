@@ -1,0 +1,1 @@
+"""The command line: the one place that ties geomocap, data_tools and viz together."""

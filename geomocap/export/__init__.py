@@ -1,0 +1,1 @@
+"""Motion files: BVH, TRC, C3D, glTF, USD, CSV."""

@@ -1,0 +1,82 @@
+"""Frame geometry as Open3D holds it, and as the arrays that numeric code works on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+
+from geomocap.errors import GeometryError
+from geomocap.files import write_atomic
+
+
+@dataclass(frozen=True)
+class Voxels:
+    """Surface voxels of one frame.
+
+    Attributes
+    ----------
+    indices : (N, 3) int32
+        Grid indices, x, y, z, of the voxels.
+    colors : (N, 3) uint8, RGB
+    origin : (3,) float
+        Corner of voxel (0, 0, 0) with the lowest coordinates, metres, world.
+    voxel_size : float
+        Edge of a voxel, metres.
+    """
+
+    indices: np.ndarray
+    colors: np.ndarray
+    origin: np.ndarray
+    voxel_size: float
+
+    @property
+    def points(self) -> np.ndarray:
+        """Voxel centres, (N, 3) float, metres, world."""
+        return np.asarray(self.origin) + (self.indices + 0.5) * self.voxel_size
+
+    def to_open3d(self) -> o3d.geometry.VoxelGrid:
+        """Return the Open3D voxel grid; its voxels come in Open3D's own order."""
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(self.points))
+        cloud.colors = o3d.utility.Vector3dVector(self.colors / 255.0)
+        low = np.asarray(self.origin, float)
+        top = self.indices.max(axis=0, initial=0) + 1
+        high = low + top * self.voxel_size
+        return o3d.geometry.VoxelGrid.create_from_point_cloud_within_bounds(cloud, self.voxel_size, low, high)
+
+    @classmethod
+    def from_open3d(cls, grid: o3d.geometry.VoxelGrid) -> Voxels:
+        """Take over an Open3D voxel grid, voxels sorted by x, y, z index so that results repeat."""
+        voxels = grid.get_voxels()
+        indices = np.array([v.grid_index for v in voxels], dtype=np.int32).reshape(-1, 3)
+        colors = np.array([v.color for v in voxels]).reshape(-1, 3)
+        order = np.lexsort(indices.T[::-1])
+        return cls(
+            indices[order],
+            np.clip(np.rint(colors[order] * 255), 0, 255).astype(np.uint8),
+            np.array(grid.origin),
+            float(grid.voxel_size),
+        )
+
+    def write(self, path: Path) -> None:
+        """Write as PLY, whole or not at all."""
+        grid = self.to_open3d()
+        write_atomic(path, lambda p: o3d.io.write_voxel_grid(p, grid))
+
+    @classmethod
+    def read(cls, path: Path) -> Voxels:
+        """Read a voxel grid's PLY.
+
+        Raises
+        ------
+        GeometryError
+            If the file is missing or holds no voxels.
+        """
+        if not path.is_file():
+            raise GeometryError(f"{path}: no such voxel grid")
+        grid = o3d.io.read_voxel_grid(path)
+        if not grid.has_voxels():
+            raise GeometryError(f"{path}: no readable voxel grid; delete it and run again")
+        return cls.from_open3d(grid)

@@ -1,0 +1,66 @@
+"""Mapping stages over frames with any `concurrent.futures.Executor`, in order, with bounded memory."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TypeVar
+
+import numba
+
+from geomocap.progress import Progress, silent
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+@contextmanager
+def threads(workers: int | None = None) -> Iterator[ThreadPoolExecutor]:
+    """Make an executor of threads that share the cores: parallel kernels called in them get one core each.
+
+    Parameters
+    ----------
+    workers : int, optional
+        Number of threads; the number of cores if not given.
+    """
+    count = workers or os.cpu_count() or 1
+    kernel_threads = max(1, numba.get_num_threads() // count)
+    with ThreadPoolExecutor(count, initializer=numba.set_num_threads, initargs=(kernel_threads,)) as executor:
+        yield executor
+
+
+def map_items(
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    executor: Executor,
+    stage: str = "",
+    progress: Progress = silent,
+    ahead: int = 16,
+) -> Iterator[Result]:
+    """Yield `function(item)` in the order of the items, at most `ahead` of them under way at once.
+
+    The first error cancels what has not begun and is raised.
+    """
+    pending: deque[Future[Result]] = deque()
+    todo = iter(items)
+    done = 0
+    progress(stage, 0, len(items))
+    try:
+        for item in todo:
+            pending.append(executor.submit(function, item))
+            if len(pending) >= ahead:
+                break
+        while pending:
+            result = pending.popleft().result()
+            for item in todo:
+                pending.append(executor.submit(function, item))
+                break
+            done += 1
+            progress(stage, done, len(items))
+            yield result
+    finally:
+        for future in pending:
+            future.cancel()

@@ -1,0 +1,1 @@
+"""Segmentation of moving geometry into rigid bodies; it sees points only, never their source."""

@@ -1,0 +1,1 @@
+"""Joints, hierarchy and motion of segmented bodies."""

@@ -1,0 +1,1 @@
+"""Pictures out: offscreen renderings, plots, the report page."""
