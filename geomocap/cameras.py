@@ -229,7 +229,7 @@ class Rig:
                     np.column_stack([np.full(65, w), v]),
                 ]
             )
-            n = camera.cam_from_img(border) * [fx, fy]
+            n = np.asarray(camera.cam_from_img(border), dtype=np.float64) * [fx, fy]
             center = np.array([camera.principal_point_x, camera.principal_point_y])
             low = np.maximum(np.nanmin(n + center, axis=0), [-w / 2, -h / 2])
             high = np.minimum(np.nanmax(n + center, axis=0), [1.5 * w, 1.5 * h])
