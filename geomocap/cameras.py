@@ -199,7 +199,9 @@ class Rig:
         origin : (3,) float, metres, world
         directions : (N, 3) float, world, unit length
         """
-        normalized = self.cameras[camera].cam_from_img(np.asarray(pixels, dtype=np.float64))
+        normalized = np.asarray(
+            self.cameras[camera].cam_from_img(np.asarray(pixels, dtype=np.float64)), dtype=np.float64
+        )
         in_camera = np.column_stack([normalized, np.ones(len(normalized))])
         in_camera /= np.linalg.norm(in_camera, axis=1, keepdims=True)
         return self.centers[camera], in_camera @ self.cam_from_world[camera, :, :3]

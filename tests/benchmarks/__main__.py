@@ -1,4 +1,4 @@
-"""Run all benchmarks, or those named on the command line, and print one table: `python -m tests.benchmarks [NAME …]`."""
+"""Run all benchmarks, or those named, and print one table: `python -m tests.benchmarks [NAME …]`."""
 
 from __future__ import annotations
 
