@@ -1,0 +1,43 @@
+# Two commands do everything on a fresh Debian machine with Python 3.11:
+#   make demo    set up, run the main job on a built-in capture up to demo/run/review/report.html
+#   make test    set up, check the code and run the tests
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+OUT ?= demo
+export PYTHON
+export PIP_DISABLE_PIP_VERSION_CHECK = 1
+
+.PHONY: demo test test-fast lint bench clean
+
+demo: .stamps/core
+	$(BIN)/geomocap demo $(OUT)
+
+test: lint
+	$(BIN)/python -m pytest
+
+test-fast: .stamps/dev
+	$(BIN)/python -m pytest -m "not slow"
+
+lint: .stamps/dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: .stamps/dev
+	$(BIN)/python -m tests.benchmarks
+
+.stamps/core: pyproject.toml tools/system_packages.sh
+	tools/system_packages.sh
+	"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11) and "geomocap needs Python 3.11 or newer: make PYTHON=/path/to/python3.11 …")'
+	"$(PYTHON)" -m venv $(VENV)
+	$(BIN)/pip install -q -e .
+	mkdir -p .stamps && touch $@
+
+.stamps/dev: .stamps/core
+	$(BIN)/pip install -q -e '.[dev]'
+	touch $@
+
+clean:
+	rm -rf $(VENV) .stamps $(OUT) .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -prune -exec rm -rf {} +
