@@ -1,0 +1,143 @@
+"""Captures: lazy reading, and one clear line for each thing that can be wrong with them."""
+
+from __future__ import annotations
+
+import pickle
+from fractions import Fraction
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from geomocap.capture import Capture, CaptureInfo, Video, write_capture_info
+from geomocap.errors import CaptureError
+from tests.geomocap.test_cameras import make_rig
+
+
+def picture(camera: int, frame: int) -> np.ndarray:
+    image = np.zeros((240, 320, 3), np.uint8)
+    image[..., 0] = 10 * camera + 20
+    image[20:100, 8 * frame : 8 * frame + 40, 1] = 200
+    image[..., 2] = 2 * frame
+    return image
+
+
+def make_capture(path, cameras=3, frames=4):
+    write_capture_info(path, CaptureInfo(name="test", fps=25.0))
+    for c in range(cameras):
+        folder = path / "images" / f"cam{c}"
+        folder.mkdir(parents=True)
+        for k in range(frames):
+            cv2.imwrite(str(folder / f"{k:06d}.png"), picture(c, k)[..., ::-1])
+    make_rig().write(path / "sparse")
+    return path
+
+
+def write_video(path, frames=30, cut=None):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=Fraction(25), options={"g": "8", "crf": "10"})
+        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+        for k in range(frames):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture(0, k), format="rgb24")))
+        container.mux(stream.encode())
+    if cut:
+        data = path.read_bytes()
+        path.write_bytes(data[: int(len(data) * cut)])
+
+
+def test_images_are_read_as_they_were_written(tmp_path):
+    capture = Capture.open(make_capture(tmp_path))
+    assert capture.cameras == ("cam0", "cam1", "cam2")
+    assert capture.n_frames == 4 and capture.fps == 25.0
+    np.testing.assert_array_equal(capture.frame("cam1", 2), picture(1, 2))
+    assert capture.rig.names == capture.cameras
+    assert not capture.has_masks and not capture.has_background("cam0")
+
+
+def test_videos_are_read_in_any_order(tmp_path):
+    write_video(tmp_path / "videos" / "cam0.mp4")
+    write_capture_info(tmp_path, CaptureInfo(fps=25.0))
+    capture = Capture.open(tmp_path)
+    assert capture.n_frames == 30
+    video = pickle.loads(pickle.dumps(capture.sources["cam0"]))
+    for k in (0, 1, 2, 17, 16, 3, 29, 28, 0, 13):
+        error = np.abs(video.read(k).astype(int) - picture(0, k)).mean()
+        assert error < 3, f"frame {k} is not the one that was written"
+
+
+def test_truncated_video(tmp_path):
+    write_video(tmp_path / "a.mp4", cut=0.6)
+    with pytest.raises(CaptureError, match=r"a\.mp4: no readable video"):
+        len(Video(tmp_path / "a.mp4"))
+
+
+def test_missing_camera_folder(tmp_path):
+    make_capture(tmp_path)
+    write_capture_info(tmp_path, CaptureInfo(fps=25.0, cameras=("cam0", "cam7")))
+    with pytest.raises(CaptureError, match=r"camera cam7 of capture\.toml has no folder"):
+        Capture.open(tmp_path)
+
+
+def test_unequal_frame_counts(tmp_path):
+    make_capture(tmp_path)
+    (tmp_path / "images/cam1/000003.png").unlink()
+    with pytest.raises(CaptureError, match=r"unequal numbers of frames \(cam0: 4, cam1: 3, cam2: 4\)"):
+        Capture.open(tmp_path)
+
+
+def test_gap_in_the_frames(tmp_path):
+    make_capture(tmp_path)
+    (tmp_path / "images/cam1/000001.png").unlink()
+    with pytest.raises(CaptureError, match=r"000002\.png: expected frame 000001"):
+        Capture.open(tmp_path)
+
+
+def test_truncated_png(tmp_path):
+    make_capture(tmp_path)
+    file = tmp_path / "images/cam1/000001.png"
+    file.write_bytes(file.read_bytes()[:200])
+    with pytest.raises(CaptureError, match=r"cam1/000001\.png: truncated"):
+        Capture.open(tmp_path).frame("cam1", 1)
+
+
+def test_image_size_against_calibration(tmp_path):
+    make_capture(tmp_path)
+    for k in range(4):
+        cv2.imwrite(str(tmp_path / f"images/cam2/{k:06d}.png"), np.zeros((200, 320, 3), np.uint8))
+    with pytest.raises(CaptureError, match="camera cam2 are 320×200, but it is calibrated for 320×240"):
+        _ = Capture.open(tmp_path).rig
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("fps = -3", "fps: Input should be greater than 0"),
+        ("name = 'x'", "fps: Field required"),
+        ("fps = 30\nspeed = 3", "speed: Extra inputs"),
+        ("fps = ", "not valid TOML"),
+    ],
+)
+def test_wrong_capture_toml(tmp_path, text, said):
+    make_capture(tmp_path)
+    (tmp_path / "capture.toml").write_text(text)
+    with pytest.raises(CaptureError, match=said):
+        Capture.open(tmp_path)
+
+
+def test_paths_can_not_lead_out_of_the_capture(tmp_path):
+    inside, outside = tmp_path / "capture", tmp_path / "outside"
+    make_capture(inside)
+    make_capture(outside)
+    (inside / "images/cam9").symlink_to(outside / "images/cam0")
+    with pytest.raises(CaptureError, match="leads out of the capture folder"):
+        Capture.open(inside)
+
+
+def test_fingerprint_notices_changed_images(tmp_path):
+    capture = Capture.open(make_capture(tmp_path))
+    before = capture.fingerprint("images")
+    assert before == capture.fingerprint("images")
+    cv2.imwrite(str(tmp_path / "images/cam0/000000.png"), picture(2, 2))
+    assert before != capture.fingerprint("images")

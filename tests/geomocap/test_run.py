@@ -1,0 +1,108 @@
+"""Runs: atomic files, stages that know when they are out of date."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+from geomocap.errors import RunError
+from geomocap.files import write_atomic, write_text
+from geomocap.geometry import Voxels
+from geomocap.run import Run, stage_key
+
+
+def test_interrupted_writing_leaves_nothing(tmp_path):
+    def interrupted(path):
+        path.write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_atomic(tmp_path / "a" / "x.bin", interrupted)
+    assert list((tmp_path / "a").iterdir()) == []
+
+
+def test_failed_writing_keeps_the_old_file_and_says_why(tmp_path):
+    write_text(tmp_path / "x.txt", "old")
+
+    def full(path):
+        path.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(RunError, match=r"x\.txt: can't be written \(No space left on device\)"):
+        write_atomic(tmp_path / "x.txt", full)
+    assert (tmp_path / "x.txt").read_text() == "old"
+    assert os.listdir(tmp_path) == ["x.txt"]
+
+
+def test_writer_that_silently_writes_nothing_is_noticed(tmp_path):
+    with pytest.raises(RunError, match="nothing was written"):
+        write_atomic(tmp_path / "x.ply", lambda path: False)
+
+
+def test_stage_is_cleared_when_its_key_changes(tmp_path):
+    run = Run(tmp_path)
+    run.begin("voxels", "key1", ["voxels", "skeleton.npz"])
+    write_text(run.frame_file("voxels", 0), "a")
+    run.write_npz("skeleton.npz", x=np.arange(3))
+    assert not run.is_done("voxels", "key1")
+    run.finish("voxels")
+    assert run.is_done("voxels", "key1") and not run.is_done("voxels", "key2")
+    run.begin("voxels", "key1", ["voxels", "skeleton.npz"])
+    assert run.frames("voxels") == [0]
+    run.begin("voxels", "key2", ["voxels", "skeleton.npz"])
+    assert run.frames("voxels") == [] and not (tmp_path / "skeleton.npz").exists()
+
+
+def test_stage_with_a_deleted_output_is_not_done(tmp_path):
+    run = Run(tmp_path)
+    run.begin("skeleton", "key", ["skeleton.npz"])
+    run.write_npz("skeleton.npz", x=np.arange(3))
+    run.finish("skeleton")
+    (tmp_path / "skeleton.npz").unlink()
+    assert not run.is_done("skeleton", "key")
+
+
+def test_key_depends_on_everything():
+    keys = {
+        stage_key("a", {"x": 1}),
+        stage_key("a", {"x": 2}),
+        stage_key("b", {"x": 1}),
+        stage_key("a", {"x": 1}, "up"),
+    }
+    assert len(keys) == 4
+    assert stage_key("a", {"x": 1, "y": 2}) == stage_key("a", {"y": 2, "x": 1})
+
+
+def test_npz_is_never_executed(tmp_path):
+    run = Run(tmp_path)
+    np.savez(tmp_path / "bad.npz", x=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(RunError, match=r"bad\.npz: damaged"):
+        run.read_npz("bad.npz")
+    with pytest.raises(RunError, match="is no plain array"):
+        run.write_npz("x.npz", x=np.array([None]))
+    with pytest.raises(RunError, match="missing"):
+        run.read_npz("none.npz")
+
+
+def test_timings_add_up(tmp_path):
+    run = Run(tmp_path)
+    with run.timed("a") as count:
+        count["items"] = 3
+    with run.timed("b"):
+        pass  # nothing to do: no entry
+    timings = run.read_timings()
+    assert set(timings) == {"a"} and timings["a"]["items"] == 3
+
+
+def test_voxels_survive_open3d_s_file(tmp_path):
+    rng = np.random.default_rng(0)
+    indices = np.unique(rng.integers(0, 60, (2000, 3)).astype(np.int32), axis=0)
+    colors = rng.integers(0, 256, (len(indices), 3)).astype(np.uint8)
+    voxels = Voxels(indices, colors, np.array([-1.0, 0.3, 0.7]), 0.0078125)
+    voxels.write(tmp_path / "000000.ply")
+    back = Voxels.read(tmp_path / "000000.ply")
+    np.testing.assert_array_equal(back.indices, voxels.indices)
+    np.testing.assert_array_equal(back.colors, voxels.colors)
+    np.testing.assert_allclose(back.points, voxels.points, atol=1e-9)

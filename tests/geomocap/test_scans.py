@@ -1,0 +1,80 @@
+"""Scans of all kinds as point sets."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+import pytest
+import trimesh
+
+from geomocap.errors import GeometryError
+from geomocap.geometry import Voxels
+from geomocap.scans import ScanSettings, open_scans
+
+
+@pytest.mark.parametrize("ending", ["ply", "obj", "stl", "glb"])
+def test_mesh_is_sampled_on_its_surface_evenly(tmp_path, ending):
+    trimesh.creation.box(extents=(2, 4, 6)).export(tmp_path / f"box.{ending}")
+    scans = open_scans(tmp_path / f"box.{ending}", ScanSettings(samples=8800))
+    points = scans.points(0)
+    on_face = np.isclose(np.abs(points), [1, 2, 3], atol=1e-5)
+    assert points.shape == (8800, 3) and on_face.any(axis=1).all()
+    # areas of the faces: 2·24, 2·12, 2·8 of 88
+    np.testing.assert_allclose(on_face.sum(axis=0) / 8800, [48 / 88, 24 / 88, 16 / 88], atol=0.01)
+    np.testing.assert_array_equal(points, scans.points(0))
+
+
+@pytest.mark.parametrize("ending", ["ply", "pcd"])
+def test_cloud_is_read_as_it_is(tmp_path, ending):
+    points = np.random.default_rng(0).normal(size=(100, 3))
+    o3d.io.write_point_cloud(str(tmp_path / f"c.{ending}"), o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)))
+    back = open_scans(tmp_path / f"c.{ending}", ScanSettings(scale=0.001)).points(0)
+    np.testing.assert_allclose(back, points * 0.001, atol=1e-9)
+
+
+def test_voxel_grid_gives_its_centres(tmp_path):
+    indices = np.array([[0, 0, 0], [1, 2, 3]], np.int32)
+    Voxels(indices, np.zeros((2, 3), np.uint8), np.array([1.0, 2, 3]), 0.1).write(tmp_path / "v.ply")
+    np.testing.assert_allclose(
+        open_scans(tmp_path / "v.ply", ScanSettings()).points(0), [[1.05, 2.05, 3.05], [1.15, 2.25, 3.35]]
+    )
+
+
+def test_sequences_are_ordered_by_number(tmp_path):
+    for k in (10, 9, 1):
+        np.savez(tmp_path / f"scan{k}.npz", points=np.full((4, 3), float(k)))
+    scans = open_scans(tmp_path, ScanSettings())
+    assert [scans.points(k)[0, 0] for k in range(3)] == [1, 9, 10]
+    np.savez(tmp_path / "all.npz", points=np.arange(24.0).reshape(2, 4, 3))
+    both = open_scans(tmp_path / "all.npz", ScanSettings())
+    assert len(both) == 2 and both.points(1)[0, 0] == 12
+
+
+def test_spacing_is_the_mean_distance_to_the_nearest_point(tmp_path):
+    x = np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(-1, 3) * 0.02
+    np.save(tmp_path / "g.npy", x)
+    assert open_scans(tmp_path / "g.npy", ScanSettings()).spacing == pytest.approx(0.02)
+    assert open_scans(tmp_path / "g.npy", ScanSettings(spacing=5, scale=0.001)).spacing == pytest.approx(0.005)
+
+
+def test_bad_scans_are_named(tmp_path):
+    with pytest.raises(GeometryError, match="no such file"):
+        open_scans(tmp_path / "no.ply", ScanSettings())
+    with pytest.raises(GeometryError, match="holds no scans"):
+        open_scans(tmp_path, ScanSettings())
+    (tmp_path / "a.obj").write_text("nonsense")
+    with pytest.raises(GeometryError, match=r"a\.obj: "):
+        open_scans(tmp_path / "a.obj", ScanSettings()).points(0)
+    np.savez(tmp_path / "b.npz", x=np.zeros((3, 3)))
+    with pytest.raises(GeometryError, match="expected an array `points`"):
+        open_scans(tmp_path / "b.npz", ScanSettings())
+    np.savez(tmp_path / "c.npz", points=np.zeros((3, 2)))
+    with pytest.raises(GeometryError, match="expected numbers of shape"):
+        open_scans(tmp_path / "c.npz", ScanSettings())
+    np.savez(tmp_path / "d.npz", points=np.array([{}], dtype=object))
+    with pytest.raises(GeometryError, match="can't be read as plain arrays"):
+        open_scans(tmp_path / "d.npz", ScanSettings())
+    (tmp_path / "e").mkdir()
+    np.savez(tmp_path / "e/0.npz", points=np.array([[0, 0, np.nan]]))
+    with pytest.raises(GeometryError, match="1 points are not finite"):
+        open_scans(tmp_path / "e", ScanSettings()).points(0)

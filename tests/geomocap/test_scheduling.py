@@ -1,0 +1,43 @@
+"""Mapping over frames: order, bounded memory, errors."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from geomocap.scheduling import map_items, threads
+
+
+def test_results_come_in_order_and_progress_is_told():
+    said = []
+    with threads(2) as executor:
+        results = list(map_items(lambda x: x * x, range(50), executor, "squares", lambda *a: said.append(a)))
+    assert results == [x * x for x in range(50)]
+    assert said[0] == ("squares", 0, 50) and said[-1] == ("squares", 50, 50)
+
+
+def test_only_a_few_items_are_under_way():
+    started = []
+    with threads(2) as executor:
+        stream = map_items(lambda x: started.append(x) or x, range(1000), executor, ahead=4)
+        next(stream)
+        assert len(started) <= 6
+        stream.close()
+    assert len(started) <= 6
+
+
+def test_first_error_is_raised_and_the_rest_not_begun():
+    def work(x):
+        if x == 3:
+            raise ValueError("frame 3")
+        return x
+
+    with threads(1) as executor, pytest.raises(ValueError, match="frame 3"):
+        list(map_items(work, range(100), executor, ahead=2))
+
+
+def test_threads_share_the_cores():
+    with threads(2) as executor:
+        names = set(executor.map(lambda _: threading.current_thread().name, range(8)))
+    assert 1 <= len(names) <= 2
