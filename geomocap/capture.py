@@ -57,8 +57,8 @@ class FrameSource(Protocol):
         ...
 
 
-def read_image(path: Path, *, gray: bool = False) -> np.ndarray:
-    """Read an image file as (H, W, 3) uint8 RGB, or (H, W) uint8 if `gray`.
+def read_image(path: Path, *, gray: bool = False, alpha: bool = False) -> np.ndarray:
+    """Read an image file as (H, W, 3) uint8 RGB, as (H, W) uint8 if `gray`, as (H, W, 4) RGBA if `alpha`.
 
     Raises
     ------
@@ -74,7 +74,13 @@ def read_image(path: Path, *, gray: bool = False) -> np.ndarray:
         or (data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-4096:])
     )
     if whole and data:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR_RGB)
+        mode = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_UNCHANGED if alpha else cv2.IMREAD_COLOR_RGB
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
+        if alpha and image is not None:
+            conversion = {2: cv2.COLOR_GRAY2RGBA, 4: cv2.COLOR_BGRA2RGBA}.get(
+                image.shape[2] if image.ndim == 3 else 2, cv2.COLOR_BGR2RGBA
+            )
+            image = cv2.cvtColor(image, conversion)
         if image is not None:
             return image
     raise CaptureError(f"{path}: truncated or no image ({len(data)} bytes); write it again")
@@ -238,11 +244,11 @@ class Capture:
         return self._background_file(camera) is not None
 
     def background(self, camera: str) -> np.ndarray:
-        """Read the empty background picture of a camera: (H, W, 3) uint8, RGB."""
+        """Read the empty background picture of a camera: (H, W, 4) uint8, RGBA, alpha 0 where it is not known."""
         file = self._background_file(camera)
         if file is None:
             raise CaptureError(f"{self.path}: no background/{camera}.png")
-        return read_image(file)
+        return read_image(file, alpha=True)
 
     def _background_file(self, camera: str) -> Path | None:
         files = [self.path / "background" / f"{camera}{e}" for e in IMAGE_ENDINGS]

@@ -23,8 +23,7 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write(temporary)
-        if not temporary.exists():  # Open3D and OpenCV say no by a return value only
+        if write(temporary) is False or not temporary.exists():  # Open3D and OpenCV say no by a return value
             raise OSError("nothing was written; is the disk full?")
         os.replace(temporary, path)
     except OSError as error:

@@ -52,13 +52,13 @@ class Voxels:
         voxels = grid.get_voxels()
         indices = np.array([v.grid_index for v in voxels], dtype=np.int32).reshape(-1, 3)
         colors = np.array([v.color for v in voxels]).reshape(-1, 3)
+        colors = np.clip(np.rint(colors * 255), 0, 255).astype(np.uint8)
+        return cls._sorted(indices, colors, np.array(grid.origin), float(grid.voxel_size))
+
+    @classmethod
+    def _sorted(cls, indices: np.ndarray, colors: np.ndarray, origin: np.ndarray, voxel_size: float) -> Voxels:
         order = np.lexsort(indices.T[::-1])
-        return cls(
-            indices[order],
-            np.clip(np.rint(colors[order] * 255), 0, 255).astype(np.uint8),
-            np.array(grid.origin),
-            float(grid.voxel_size),
-        )
+        return cls(indices[order], colors[order], origin, voxel_size)
 
     def write(self, path: Path) -> None:
         """Write as PLY, whole or not at all."""
@@ -76,7 +76,46 @@ class Voxels:
         """
         if not path.is_file():
             raise GeometryError(f"{path}: no such voxel grid")
+        voxels = _read_binary(path)
+        if voxels is not None:
+            return cls._sorted(*voxels)
         grid = o3d.io.read_voxel_grid(path)
         if not grid.has_voxels():
             raise GeometryError(f"{path}: no readable voxel grid; delete it and run again")
         return cls.from_open3d(grid)
+
+
+_HEADER = b"""ply
+format binary_little_endian 1.0
+comment Created by Open3D
+element origin 1
+property double x
+property double y
+property double z
+element rotation 1
+"""
+_VOXEL = np.dtype([("index", "<f8", 3), ("color", "u1", 3)])
+
+
+def _read_binary(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
+    """Read a voxel grid as Open3D writes it, a hundred times faster than voxel by voxel; None if it is another kind."""
+    data = path.read_bytes()
+    head, _, body = data.partition(b"end_header\n")
+    lines = head.decode("ascii", "replace").splitlines()
+    vertex = [line for line in lines if line.startswith("element vertex ")]
+    properties = [line for line in lines[lines.index(vertex[0]) + 1 :]] if vertex else []
+    if not data.startswith(_HEADER) or properties != [
+        "property double x",
+        "property double y",
+        "property double z",
+        "property uchar red",
+        "property uchar green",
+        "property uchar blue",
+    ]:
+        return None
+    count = int(vertex[0].split()[-1])
+    frame = np.frombuffer(body, "<f8", 13)  # origin, rotation, voxel size
+    if len(body) != 13 * 8 + count * _VOXEL.itemsize or not np.array_equal(frame[3:12].reshape(3, 3), np.eye(3)):
+        return None
+    voxels = np.frombuffer(body, _VOXEL, count, 13 * 8)
+    return voxels["index"].astype(np.int32), np.array(voxels["color"]), np.array(frame[:3]), float(frame[12])

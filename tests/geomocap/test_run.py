@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 
 import numpy as np
+import open3d as o3d
 import pytest
 
 from geomocap.errors import RunError
@@ -106,3 +107,8 @@ def test_voxels_survive_open3d_s_file(tmp_path):
     np.testing.assert_array_equal(back.indices, voxels.indices)
     np.testing.assert_array_equal(back.colors, voxels.colors)
     np.testing.assert_allclose(back.points, voxels.points, atol=1e-9)
+    slow = Voxels.from_open3d(o3d.io.read_voxel_grid(str(tmp_path / "000000.ply")))
+    np.testing.assert_array_equal(back.indices, slow.indices)
+    np.testing.assert_array_equal(back.colors, slow.colors)
+    o3d.io.write_voxel_grid(str(tmp_path / "ascii.ply"), voxels.to_open3d(), write_ascii=True)
+    np.testing.assert_array_equal(Voxels.read(tmp_path / "ascii.ply").indices, voxels.indices)
