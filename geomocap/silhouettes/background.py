@@ -1,0 +1,296 @@
+"""Background model of a camera: what it sees without the subject, how noisy that is, and where it is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit, prange
+
+from geomocap.errors import CaptureError
+from geomocap.silhouettes.light import light_change
+from geomocap.silhouettes.settings import SilhouetteSettings
+
+LEAST_NOISE = 0.7  # grey levels; 8-bit rounding alone gives 0.29, compression hides the rest in flat parts
+GRADIENT_BINS = 12
+LIT = 0.15  # fraction of the frames that must show a place lit for the others to be its shadow
+
+
+@dataclass(frozen=True)
+class BackgroundModel:
+    """What a static camera sees without the subject.
+
+    Attributes
+    ----------
+    mean : (H, W, 3) float32
+        Background, grey levels, RGB.
+    sigma : (H, W) float32
+        Standard deviation of a frame against it (per channel), grey levels.
+    known : (H, W) bool
+        Where the background is known.
+    camera : str
+        Name of the camera, for messages.
+    """
+
+    mean: np.ndarray
+    sigma: np.ndarray
+    known: np.ndarray
+    camera: str = ""
+
+    def __post_init__(self) -> None:
+        shape = np.shape(self.known)
+        if len(shape) != 2 or self.mean.shape != (*shape, 3) or self.sigma.shape != shape:
+            raise CaptureError(
+                f"background{_of(self.camera)}: mean {self.mean.shape}, sigma {self.sigma.shape} and known {shape} "
+                "don't fit; expected (H, W, 3), (H, W) and (H, W)"
+            )
+        object.__setattr__(self, "mean", np.ascontiguousarray(self.mean, np.float32))
+        object.__setattr__(self, "sigma", np.ascontiguousarray(self.sigma, np.float32))
+        object.__setattr__(self, "known", np.ascontiguousarray(self.known, bool))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        return self.known.shape[1], self.known.shape[0]
+
+    def check(self, image: np.ndarray) -> None:
+        """Raise CaptureError if an image is no (H, W, 3) uint8 of this size."""
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            raise CaptureError(f"image{_of(self.camera)}: {image.shape} {image.dtype}; expected (H, W, 3) uint8")
+        if image.shape[:2] != self.known.shape:
+            w, h = self.size
+            raise CaptureError(
+                f"background{_of(self.camera)}: {w}×{h} pixels, but the images are {image.shape[1]}×{image.shape[0]}; "
+                "take the background picture with the settings of the recording"
+            )
+
+
+def _of(camera: str) -> str:
+    return f" of camera {camera}" if camera else ""
+
+
+def model_from_plate(
+    plate: np.ndarray,
+    frames: Sequence[np.ndarray],
+    settings: SilhouetteSettings | None = None,
+    camera: str = "",
+) -> BackgroundModel:
+    """Make the background model from a picture of the empty scene and some frames of the recording.
+
+    The frames give the noise, and, where they agree with the plate, a background with less noise than the plate's own.
+
+    Parameters
+    ----------
+    plate : (H, W, 3) or (H, W, 4) uint8
+        Empty scene, RGB or RGBA; alpha 0 marks pixels where the background isn't known.
+    frames : sequence of (H, W, 3) uint8
+        Some frames spread over the recording; about 10 are enough.
+    settings : SilhouetteSettings, optional
+    camera : str
+        Name of the camera, for messages.
+
+    Raises
+    ------
+    CaptureError
+        If the plate's size isn't the frames', or there are no frames.
+    """
+    settings = settings or SilhouetteSettings()
+    if not len(frames):
+        raise CaptureError(f"background{_of(camera)}: no frames to measure the noise on; expected at least one")
+    known = plate[..., 3] > 127 if plate.shape[-1] == 4 else np.ones(plate.shape[:2], bool)
+    mean = plate[..., :3].astype(np.float32)
+    model = BackgroundModel(mean, np.full(known.shape, 2.0, np.float32), known, camera)
+    for image in frames:
+        model.check(image)
+    for _ in range(2):
+        lights = [_light(image, model, settings) for image in frames]
+        sigma = _noise(frames, lights, model)
+        model = BackgroundModel(_agreeing_mean(frames, lights, mean, sigma), sigma, known, camera)
+    return model
+
+
+def model_from_frames(
+    frames: Sequence[np.ndarray], settings: SilhouetteSettings | None = None, camera: str = ""
+) -> BackgroundModel:
+    """Estimate the background over time: at each pixel the colour that the most frames agree on.
+
+    Where too few frames agree (the subject never leaves, and moves), the background is unknown.
+
+    Parameters
+    ----------
+    frames : sequence of (H, W, 3) uint8
+        Frames spread over the recording; 20 to 40 are enough.
+    settings : SilhouetteSettings, optional
+    camera : str
+        Name of the camera, for messages.
+
+    Raises
+    ------
+    CaptureError
+        If there are fewer than three frames, or their sizes differ.
+    """
+    settings = settings or SilhouetteSettings()
+    if len(frames) < 3:
+        raise CaptureError(
+            f"background{_of(camera)}: {len(frames)} frames; an estimate over time needs at least 3: "
+            "record more, or add an empty picture to background/"
+        )
+    stack = np.stack(list(frames))
+    median = np.median(stack, axis=0).astype(np.float32)
+    known = np.ones(median.shape[:2], bool)
+    model = BackgroundModel(median, np.full(known.shape, 2.0, np.float32), known, camera)
+    model.check(frames[0])
+    lights = [_light(image, model, settings) for image in frames]
+    sigma = _noise(frames, lights, model)
+    gains = np.array([g for g, _ in lights], np.float32)
+    offsets = np.array([o for _, o in lights], np.float32)
+    mean, support = agreement(stack, gains, offsets, 3.0 * sigma, LIT)
+    model = BackgroundModel(mean, sigma, known, camera)
+    sigma = _noise(frames, lights, model)
+    least = max(settings.support, 2.0 / len(frames))
+    return BackgroundModel(mean, sigma, support >= least, camera)
+
+
+def _light(image: np.ndarray, model: BackgroundModel, settings: SilhouetteSettings) -> tuple[np.ndarray, np.ndarray]:
+    if not settings.gain:
+        return np.ones(3), np.zeros(3)
+    return light_change(image, model.mean, model.sigma, model.known)
+
+
+def _noise(
+    frames: Sequence[np.ndarray], lights: Sequence[tuple[np.ndarray, np.ndarray]], model: BackgroundModel
+) -> np.ndarray:
+    """Standard deviation of the frames against the background, (H, W) float32.
+
+    Variance a + b · gradient², fitted to robust variances (median absolute deviation, so that the subject does not
+    count) of pixels sorted by the background's gradient: edges move by fractions of a pixel and are compressed worst.
+    """
+    gradient = _gradient(model.mean)
+    step = max(1, int(np.sqrt(gradient.size / 20000)))
+    part = (slice(None, None, step), slice(None, None, step))
+    use = model.known[part] & (model.mean[part] > 6).all(-1) & (model.mean[part] < 249).all(-1)
+    if use.sum() < 50:
+        use = model.known[part]
+    g = gradient[part][use]
+    if g.size < 50:
+        return np.full(gradient.shape, 2.0, np.float32)
+    residuals = np.array(
+        [
+            (f[part][use] - (gain * model.mean[part][use] + offset))
+            for f, (gain, offset) in zip(frames, lights, strict=True)
+        ]
+    )
+    edges = np.quantile(g, np.linspace(0, 1, GRADIENT_BINS + 1))
+    which = np.clip(np.searchsorted(edges, g, side="right") - 1, 0, GRADIENT_BINS - 1)
+    x, y = [], []
+    for k in range(GRADIENT_BINS):
+        inside = which == k
+        if inside.sum() >= 20:
+            r = residuals[:, inside]
+            x.append(np.median(g[inside]) ** 2)
+            y.append((1.4826 * np.median(np.abs(r))) ** 2)
+    a = max(float(np.median(y[: max(1, len(y) // 2)])), LEAST_NOISE**2)
+    slopes = [max(0.0, (v - a) / u) for u, v in zip(x, y, strict=True) if u > 1.0]
+    b = float(np.median(slopes)) if slopes else 0.0
+    return np.sqrt(a + b * gradient**2).astype(np.float32)
+
+
+def _gradient(mean: np.ndarray) -> np.ndarray:
+    """Largest gradient of the three channels, grey levels a pixel, (H, W) float32."""
+    dx, dy = cv2.Sobel(mean, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(mean, cv2.CV_32F, 0, 1, scale=1 / 8)
+    return np.sqrt((dx * dx + dy * dy).max(axis=-1))
+
+
+def _agreeing_mean(
+    frames: Sequence[np.ndarray],
+    lights: Sequence[tuple[np.ndarray, np.ndarray]],
+    plate: np.ndarray,
+    sigma: np.ndarray,
+) -> np.ndarray:
+    """Mean of the plate and the frames that agree with it within 3 sigma in all channels."""
+    total, count = plate.copy(), np.ones(sigma.shape, np.float32)
+    for image, (gain, offset) in zip(frames, lights, strict=True):
+        corrected = ((image - offset) / gain).astype(np.float32)
+        agrees = (np.abs(corrected - plate).max(axis=-1) < 3.0 * sigma).astype(np.float32)
+        total += corrected * agrees[..., None]
+        count += agrees
+    return total / count[..., None]
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def agreement(stack, gains, offsets, reach, lit):
+    """Find at each pixel the colour that the most frames agree on.
+
+    Parameters
+    ----------
+    stack : (T, H, W, 3) uint8
+    gains, offsets : (T, 3) float32
+        Light of each frame, frame = gain · background + offset.
+    reach : (H, W) float32
+        Colours within this distance in every channel agree, grey levels.
+    lit : float
+        Fraction of the frames from which a smaller group is preferred of which the largest one is a shadow.
+
+    Returns
+    -------
+    mean : (H, W, 3) float32
+        Mean colour of the largest group (the first of equals), or of the one that it is a shadow of.
+    support : (H, W) float32
+        Fraction of the frames in it.
+    """
+    n, h, w = stack.shape[0], stack.shape[1], stack.shape[2]
+    mean = np.empty((h, w, 3), np.float32)
+    support = np.empty((h, w), np.float32)
+    for y in prange(h):
+        values = np.empty((n, 3), np.float32)
+        counts = np.empty(n, np.int64)
+        for x in range(w):
+            for t in range(n):
+                for c in range(3):
+                    values[t, c] = (np.float32(stack[t, y, x, c]) - offsets[t, c]) / gains[t, c]
+            limit = reach[y, x]
+            most, best = 0, 0
+            for t in range(n):
+                counts[t] = 0
+                for u in range(n):
+                    if (
+                        abs(values[u, 0] - values[t, 0]) <= limit
+                        and abs(values[u, 1] - values[t, 1]) <= limit
+                        and abs(values[u, 2] - values[t, 2]) <= limit
+                    ):
+                        counts[t] += 1
+                if counts[t] > most:
+                    most, best = counts[t], t
+            shaded = best
+            for t in range(n):
+                if counts[t] >= max(2, lit * n) and (shaded == best or counts[t] > counts[best]):
+                    if _shades(values[t], values[shaded], limit):
+                        best = t
+            most = counts[best]
+            for c in range(3):
+                total = np.float32(0.0)
+                for u in range(n):
+                    if (
+                        abs(values[u, 0] - values[best, 0]) <= limit
+                        and abs(values[u, 1] - values[best, 1]) <= limit
+                        and abs(values[u, 2] - values[best, 2]) <= limit
+                    ):
+                        total += values[u, c]
+                mean[y, x, c] = total / most
+            support[y, x] = most / n
+    return mean, support
+
+
+@njit(cache=True, nogil=True)
+def _shades(light, dark, limit):
+    """Whether `dark` is `light` under a shadow: the same colour, times 0.3 to 0.95."""
+    both = light[0] * dark[0] + light[1] * dark[1] + light[2] * dark[2]
+    factor = both / (light[0] * light[0] + light[1] * light[1] + light[2] * light[2] + np.float32(1e-6))
+    if not (0.3 < factor < 0.95):
+        return False
+    for c in range(3):
+        if abs(dark[c] - factor * light[c]) > limit:
+            return False
+    return True

@@ -1,0 +1,144 @@
+"""Silhouettes: frame and background model in, mask out."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from geomocap.errors import CaptureError
+from geomocap.silhouettes.background import BackgroundModel
+from geomocap.silhouettes.evidence import background_evidence, shadow_evidence, smooth_evidence
+from geomocap.silhouettes.light import light_change
+from geomocap.silhouettes.outline import refine_outline
+from geomocap.silhouettes.settings import SilhouetteSettings
+
+
+def silhouette(
+    image: np.ndarray,
+    model: BackgroundModel,
+    settings: SilhouetteSettings | None = None,
+    region: np.ndarray | None = None,
+) -> np.ndarray:
+    """Cut out what stands before the background.
+
+    Parameters
+    ----------
+    image : (H, W, 3) uint8
+        Frame, RGB.
+    model : BackgroundModel
+        Of the same camera.
+    settings : SilhouetteSettings, optional
+    region : (H, W) bool, optional
+        Only within this region; see `region_of_points`.
+
+    Returns
+    -------
+    (H, W) uint8
+        0 or 255. Empty or full if the image says so: check its `coverage`.
+
+    Raises
+    ------
+    CaptureError
+        If image or region haven't the model's size.
+    """
+    settings = settings or SilhouetteSettings()
+    model.check(image)
+    if region is not None and region.shape != model.known.shape:
+        raise CaptureError(f"region of interest {region.shape}: expected {model.known.shape}, the size of the images")
+    image = np.ascontiguousarray(image)
+
+    # Light of this frame, from the background alone
+    gain, offset = (
+        light_change(image, model.mean, model.sigma, model.known) if settings.gain else (np.ones(3), np.zeros(3))
+    )
+    light = gain.astype(np.float32), offset.astype(np.float32)
+
+    # Evidence of each pixel against background and shadow, then of its surroundings
+    evidence = pixel_evidence(image, model, settings, light)
+    if region is not None:
+        evidence[~region] = -10.0
+    voted = evidence
+    if settings.smoothing > 0:
+        voted = smooth_evidence(evidence, image, model.sigma, np.float32(settings.smoothing), np.float32(settings.edge))
+
+    # Subject or not, its outline to half a pixel, pieces and holes that aren't real
+    mask = voted > 0
+    mask = clean(mask, evidence, settings)
+    mask = refine_outline(mask, image, model.mean, model.known, model.sigma, *light)
+    if region is not None:
+        mask &= region
+    return mask.astype(np.uint8) * np.uint8(255)
+
+
+def pixel_evidence(
+    image: np.ndarray,
+    model: BackgroundModel,
+    settings: SilhouetteSettings,
+    light: tuple[np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """Return each pixel's own evidence for the subject, (H, W) float32, log likelihood ratio."""
+    evidence = background_evidence(
+        image,
+        model.mean,
+        model.sigma,
+        model.known,
+        *light,
+        np.float32(settings.threshold),
+        np.float32(settings.unknown),
+    )
+    if not settings.shadows:
+        return evidence
+    return shadow_evidence(
+        evidence,
+        image,
+        model.mean,
+        model.sigma,
+        model.known,
+        *light,
+        settings.shadow_radius,
+        settings.shadow_darkest,
+        settings.shadow_lightest,
+        settings.shadow_color,
+    )
+
+
+def clean(mask: np.ndarray, evidence: np.ndarray, settings: SilhouetteSettings) -> np.ndarray:
+    """Drop small pieces, and fill enclosed holes whose evidence for the background is weak.
+
+    Parameters
+    ----------
+    mask : (H, W) bool
+    evidence : (H, W) float32
+        Of each pixel itself.
+    settings : SilhouetteSettings
+
+    Returns
+    -------
+    (H, W) bool
+    """
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    if count == 1:
+        return mask
+    areas = stats[:, cv2.CC_STAT_AREA].copy()
+    areas[0] = 0
+    least = max(settings.smallest * mask.size, settings.smallest_relative * areas.max())
+    mask = (areas >= least)[labels]
+
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
+    h, w = mask.shape
+    x, y, width, height = (stats[:, k] for k in range(4))
+    fill = (x > 0) & (y > 0) & (x + width < w) & (y + height < h)
+    fill[0] = False
+    for k in np.flatnonzero(fill):
+        part = (slice(y[k], y[k] + height[k]), slice(x[k], x[k] + width[k]))
+        inside = labels[part] == k
+        if evidence[part][inside].mean() > settings.hole_evidence:
+            mask[part] |= inside
+    return mask
+
+
+def coverage(mask: np.ndarray, region: np.ndarray | None = None) -> float:
+    """Return the fraction of the image (or of the region) that a silhouette covers: 0 empty, 1 full."""
+    if region is not None:
+        mask = mask[region]
+    return float(np.count_nonzero(mask)) / max(1.0, float(mask.size))
