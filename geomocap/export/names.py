@@ -1,0 +1,121 @@
+"""Names of bodies and joints: stable ones by number, or the user's from `names.toml`.
+
+# names.toml
+thigh_left = 3            # body 3
+shank_left = 5
+
+[joints]                  # optional; a joint between named bodies is otherwise called after them
+knee_left = 4
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from geomocap.export.errors import MotionError
+
+
+@dataclass(frozen=True)
+class Names:
+    """Names given by the user.
+
+    Attributes
+    ----------
+    bodies, joints : mapping of number to name
+    source : str
+        Where they come from, for messages.
+    """
+
+    bodies: Mapping[int, str] = field(default_factory=dict)
+    joints: Mapping[int, str] = field(default_factory=dict)
+    source: str = "names"
+
+    def __post_init__(self) -> None:
+        for kind in (self.bodies, self.joints):
+            for name in kind.values():
+                if not name or any(c.isspace() or c in "{}/\\" for c in name):
+                    raise MotionError(
+                        f"{self.source}: {name!r} is no usable name; leave out spaces, braces and slashes"
+                    )
+
+    @classmethod
+    def read(cls, path: Path) -> Names:
+        """Read `names.toml`.
+
+        Raises
+        ------
+        MotionError
+            If the file can't be read, or a value isn't a body's number, or a number is named twice.
+        """
+        try:
+            table = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise MotionError(f"{path}: can't be read ({error.strerror})") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise MotionError(f"{path}: not valid TOML ({error})") from None
+        joints = table.pop("joints", {})
+        bodies = {**table.pop("bodies", {}), **table}
+        return cls(_by_number(bodies, path, "body"), _by_number(joints, path, "joint"), str(path))
+
+    def body_names(self, n: int, found: Sequence[str] | None = None) -> tuple[str, ...]:
+        """Return the names of `n` bodies: the user's, or the found ones, or `body00` …"""
+        self._check(self.bodies, n, "body", "bodies")
+        default = found if found is not None else [f"body{b:02d}" for b in range(n)]
+        return _unique([self.bodies.get(b, str(default[b])) for b in range(n)], self.source)
+
+    def joint_names(
+        self, joint_bodies: np.ndarray, body_names: Sequence[str], found: Sequence[str] | None = None
+    ) -> tuple[str, ...]:
+        """Return the names of joints: the user's, or those of the bodies that it joins where the user named any.
+
+        Parameters
+        ----------
+        joint_bodies : (J, 2) int
+            Parent and child body.
+        body_names : sequence of str
+            From `body_names`.
+        found : sequence of str, optional
+            Names of the joints so far.
+        """
+        n = len(joint_bodies)
+        self._check(self.joints, n, "joint", "joints")
+        names = []
+        for j, (parent, child) in enumerate(joint_bodies.tolist()):
+            renamed = parent in self.bodies or child in self.bodies
+            default = f"joint_{body_names[parent]}_{body_names[child]}" if renamed or found is None else str(found[j])
+            names.append(self.joints.get(j, default))
+        return _unique(names, self.source, number_repeats=True)
+
+    def _check(self, kind: Mapping[int, str], n: int, one: str, many: str) -> None:
+        for number, name in kind.items():
+            if not 0 <= number < n:
+                raise MotionError(
+                    f"{self.source}: {name} names {one} {number}, but there are {n} {many} (0 to {n - 1})"
+                )
+
+
+def _by_number(table: Mapping[str, object], path: Path, kind: str) -> dict[int, str]:
+    names: dict[int, str] = {}
+    for name, number in table.items():
+        if isinstance(number, bool) or not isinstance(number, int):
+            raise MotionError(f"{path}: {name} = {number!r}; expected the number of a {kind}, e.g. {name} = 3")
+        if number in names:
+            raise MotionError(f"{path}: {kind} {number} is named twice, {names[number]} and {name}")
+        names[number] = name
+    return names
+
+
+def _unique(names: list[str], source: str, *, number_repeats: bool = False) -> tuple[str, ...]:
+    seen: dict[str, int] = {}
+    result = []
+    for name in names:
+        seen[name] = seen.get(name, 0) + 1
+        if seen[name] > 1 and not number_repeats:
+            raise MotionError(f"{source}: the name {name} stands for two things; give each its own")
+        result.append(name if seen[name] == 1 else f"{name}_{seen[name]}")
+    return tuple(result)
