@@ -1,0 +1,100 @@
+"""The floor of free views: a metric grid and a soft contact shadow, drawn behind the subject."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from viz.render import PAPER
+from viz.shapes import Mesh
+from viz.views import PinholeView, Stage
+
+LINE = (222, 225, 229)
+SHADE = (120, 126, 135)
+
+
+def grid_spacing(extent: float) -> float:
+    """Return the distance of grid lines, metres: 1, 2 or 5 times a power of ten, about a sixth of the extent."""
+    power = 10.0 ** np.floor(np.log10(max(extent, 1e-6) / 6))
+    return float(max(m for m in (1, 2, 5) if m * power <= extent / 6 + 1e-12) * power)
+
+
+def floor(stage: Stage, view: PinholeView, meshes: Sequence[Mesh] = (), center: np.ndarray | None = None) -> np.ndarray:
+    """Draw the floor as a view sees it: (H, W, 3) uint8, RGB.
+
+    Parameters
+    ----------
+    stage : Stage
+    view : PinholeView
+    meshes : sequence of Mesh
+        What throws the shadow.
+    center : (3,) float, optional
+        Middle of the grid; the first frame's centre if not given.
+    """
+    width, height = view.size
+    scale = 2
+    image = np.full((height * scale, width * scale, 3), PAPER, np.float32)
+    right = stage.broad
+    ahead = np.cross(stage.up, right)
+    middle = stage.centers[0] if center is None else np.asarray(center, float)
+    base = middle - stage.up * (middle @ stage.up - stage.floor)
+    basis = np.array([right, ahead])
+    seen_from_below = view.cam_from_world[:, :3].T @ view.cam_from_world[:, 3] @ stage.up > -stage.floor
+    if seen_from_below:
+        return image[::scale, ::scale].astype(np.uint8)
+
+    if meshes:
+        _shadow(image, stage, view, meshes, base, basis, scale)
+    step = grid_spacing(stage.extent)
+    # The grid is fixed to the world: lines are at multiples of the step.
+    origin = basis @ base
+    reach = max(0.75 * stage.extent, 2 * step)
+    first, last = np.floor((origin - reach) / step), np.ceil((origin + reach) / step)
+    for k in range(2):
+        for i in np.arange(first[k], last[k] + 1) * step:
+            ends = np.array([first[1 - k], last[1 - k]]) * step
+            flat = np.column_stack([np.full(33, i), np.linspace(ends[0], ends[1], 33)])[:, [0, 1] if k == 0 else [1, 0]]
+            _line(image, view, base + (flat - origin) @ basis, scale)
+    return cv2.resize(np.clip(image, 0, 255).astype(np.uint8), (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _line(image: np.ndarray, view: PinholeView, points: np.ndarray, scale: int) -> None:
+    pixels, _ = view.project(points)
+    for a, b in pairwise(pixels):
+        if np.isfinite([a, b]).all() and np.abs([a, b]).max() < 1e4:
+            start, end = (tuple(int(v) for v in np.rint((p * scale - 0.5) * 16)) for p in (a, b))
+            cv2.line(image, start, end, LINE, 1, cv2.LINE_AA, 4)
+
+
+def _shadow(
+    image: np.ndarray,
+    stage: Stage,
+    view: PinholeView,
+    meshes: Sequence[Mesh],
+    base: np.ndarray,
+    basis: np.ndarray,
+    scale: int,
+) -> None:
+    """Darken the floor below the meshes, the more the nearer they are to it."""
+    cells = 160
+    reach = 0.75 * stage.extent
+    vertices = np.concatenate([m.vertices for m in meshes])
+    flat = (vertices - base) @ basis.T
+    height = (vertices - base) @ stage.up
+    weight = np.exp(-np.maximum(height, 0) / (0.12 * stage.extent))
+    index = np.floor((flat / reach + 1) / 2 * cells).astype(int)
+    inside = ((index >= 0) & (index < cells)).all(axis=1)
+    table = np.zeros((cells, cells), np.float32)
+    np.maximum.at(table, (index[inside, 1], index[inside, 0]), weight[inside].astype(np.float32))
+    table = 0.5 * cv2.GaussianBlur(table, (0, 0), 2.0) + 0.5 * cv2.GaussianBlur(table, (0, 0), 6.0)
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float) * reach
+    pixels, depth = view.project(base + corners @ basis)
+    if (depth <= 0).any():
+        return
+    source = np.array([[0, 0], [cells, 0], [cells, cells], [0, cells]], np.float32) - 0.5
+    H = cv2.getPerspectiveTransform(source, (pixels * scale - 0.5).astype(np.float32))
+    dark = cv2.warpPerspective(table, H, (image.shape[1], image.shape[0]))[..., None]
+    image[:] = image + np.clip(0.55 * dark, 0, 1) * (np.array(SHADE, np.float32) - image)
