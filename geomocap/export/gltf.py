@@ -111,7 +111,7 @@ class _File:
         weights = mesh.weights.astype(np.float32)
         weights /= weights.sum(axis=1, keepdims=True)
         color = np.full((len(position), 4), 65535, np.uint16)
-        color[:, :3] = np.rint(_linear(mesh.colors / 255.0) * 65535)
+        color[:, :3] = np.rint(linear_light(mesh.colors / 255.0) * 65535)
         vertex = gltf.ARRAY_BUFFER
         attributes = gltf.Attributes(
             POSITION=self.accessor(
@@ -153,6 +153,6 @@ class _File:
         return b"".join(self.document.save_to_bytes())
 
 
-def _linear(srgb: np.ndarray) -> np.ndarray:
+def linear_light(srgb: np.ndarray) -> np.ndarray:
     """Linear light of sRGB values between 0 and 1."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
