@@ -7,10 +7,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from geomocap.errors import GeometryError
+from geomocap.errors import GeomocapError
 
 WORLD_FROM_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 """Turns glTF's axes (Y up, Z towards the viewer) into ours (Z up), (4, 4)."""
+
+
+class AssetError(GeomocapError):
+    """A file of a subject that can't be read or animated."""
 
 
 @dataclass(frozen=True)
@@ -92,14 +96,14 @@ class AnimatedAsset:
     def __post_init__(self) -> None:
         V, S, J = len(self.bind_vertices), len(self.slot_joints), len(self.joint_names)
         if not V or not len(self.faces):
-            raise GeometryError(f"{self.name}: no triangles in it; export the mesh together with the animation")
+            raise AssetError(f"{self.name}: no triangles in it; export the mesh together with the animation")
         if self.slot_weights.shape != (V, S) or self.slot_from_bind.shape != (S, 4, 4):
-            raise GeometryError(
+            raise AssetError(
                 f"{self.name}: weights {self.slot_weights.shape} and bind matrices {self.slot_from_bind.shape} "
                 f"don't fit {V} vertices and {S} slots"
             )
         if len(self.joint_parents) != J or np.any(self.joint_parents >= J):
-            raise GeometryError(f"{self.name}: {J} joints, but parents {self.joint_parents.tolist()}")
+            raise AssetError(f"{self.name}: {J} joints, but parents {self.joint_parents.tolist()}")
 
     @property
     def scale(self) -> float:
@@ -144,6 +148,19 @@ class AnimatedAsset:
         u, _, vt = np.linalg.svd(world[:, :3, :3])
         u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
         return world[:, :3, 3].copy(), u @ vt
+
+    def welded(self, normals: np.ndarray) -> AnimatedAsset:
+        """Return the asset with vertices that lie together at rest sharing one normal, unless the file parts them.
+
+        Parameters
+        ----------
+        normals : (V, 3) float
+            The file's normals; where they differ there is a sharp edge. Zeros make the surface smooth everywhere.
+        """
+        rest = self.vertices(None)
+        size = float(np.ptp(rest, axis=0).max()) or 1.0
+        key = np.column_stack([np.rint(rest / size * 1e5), np.rint(normals * 20)])
+        return replace(self, normals_group=np.unique(key, axis=0, return_inverse=True)[1].ravel())
 
     def standing(self, height: float | None = None, samples: int = 60) -> AnimatedAsset:
         """Return the asset put on the floor: lowest point of the whole clip at z = 0, centred over the origin.

@@ -17,6 +17,10 @@ from geomocap.cameras import Rig
 SAMPLES, EDGE_SAMPLES = 2, 4  # rays a pixel are these squared: everywhere on the subject, and on its outline
 
 
+def _tensor(array: np.ndarray) -> o3d.core.Tensor:
+    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array))
+
+
 @dataclass(frozen=True)
 class PosedSubject:
     """The subject at one time, ready for ray casting.
@@ -36,7 +40,7 @@ class PosedSubject:
     def of(cls, surface: Surface, vertices: np.ndarray) -> PosedSubject:
         """Build the ray casting scene (with one thread, so that the same rays always hit the same triangles)."""
         scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(surface.faces.astype("u4")))
+        scene.add_triangles(_tensor(vertices.astype(np.float32)), _tensor(surface.faces.astype(np.uint32)))
         return cls(vertices, surface.normals(vertices), scene)
 
 
@@ -78,7 +82,7 @@ class FloorShadow:
         rays = np.zeros((len(k), ny, nx, 6), dtype=np.float32)
         rays[..., 0], rays[..., 1], rays[..., 2] = gx, gy, 1e-4
         rays[..., 3:] = toward[:, None, None]
-        blocked = subject.scene.test_occlusions(o3d.core.Tensor(rays)).numpy().mean(axis=0, dtype=np.float32)
+        blocked = subject.scene.test_occlusions(_tensor(rays)).numpy().mean(axis=0, dtype=np.float32)
         return cls(low, cell, cv2.GaussianBlur(blocked, (0, 0), 1.0))
 
     def at(self, positions: np.ndarray) -> np.ndarray:
@@ -135,8 +139,9 @@ def render_subject(
     full = np.zeros(width * height, dtype=np.uint8)
     touched[pixels], full[pixels] = coverage > 0, coverage == 1
     around = np.ones((3, 3), np.uint8)
-    outline = cv2.dilate(touched.reshape(height, width), around) & ~cv2.erode(full.reshape(height, width), around) & 1
-    again = outline.ravel()[pixels] > 0
+    near = cv2.dilate(touched.reshape(height, width), around).ravel() > 0
+    inner = cv2.erode(full.reshape(height, width), around).ravel() > 0
+    again = (near & ~inner)[pixels]
     coverage[again], colors[again] = _cast(subject, surface, view, light, pixels[again], EDGE_SAMPLES)
     return pixels, coverage, colors
 
@@ -147,7 +152,7 @@ def _cast(
     if not len(pixels):
         return np.zeros(0, np.float32), np.zeros((0, 3), np.float32)
     rays = view.rays(pixels, samples).reshape(-1, 6)
-    hits = subject.scene.cast_rays(o3d.core.Tensor(rays))
+    hits = subject.scene.cast_rays(_tensor(rays))
     triangle = hits["primitive_ids"].numpy()
     hit = np.flatnonzero(triangle != o3d.t.geometry.RaycastingScene.INVALID_ID)
     uvs = hits["primitive_uvs"].numpy()[hit]

@@ -65,7 +65,8 @@ def box(low: tuple[float, float, float], high: tuple[float, float, float], steps
     """Make a box with sharp edges between two corners, metres; each side a grid of `steps`² squares."""
     a, b = np.array(low), np.array(high)
     u, v = (g.ravel() for g in np.meshgrid(np.linspace(0, 1, steps + 1), np.linspace(0, 1, steps + 1)))
-    vertices, faces, uv, group = [], [], [], []
+    vertices: list[np.ndarray] = []
+    faces, uv, group = [], [], []
     for axis in range(3):
         for side in (0.0, 1.0):
             unit = np.zeros((len(u), 3))
