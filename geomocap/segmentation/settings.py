@@ -1,0 +1,49 @@
+"""Settings of the segmentation and of the skeleton that is built on it."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from geomocap.settings import Settings
+
+
+class SegmentationSettings(Settings):
+    """How points are divided into ellipsoids and these into rigid bodies."""
+
+    method: Literal["m3"] = Field(
+        default="m3", description="m3: split, merge, match and compare paths, as in the paper"
+    )
+    max_depth: int = Field(
+        default=7, ge=1, le=10, description="levels of splitting; at most 2^levels ellipsoids a frame"
+    )
+    min_points: int = Field(
+        default=16, ge=4, description="least points of an ellipsoid; smaller sets are not split further"
+    )
+    split_error: float = Field(
+        default=0.2,
+        gt=0,
+        description="fitting error above which an ellipsoid is split (equivalent length, point spacings)",
+    )
+    merge_error: float = Field(
+        default=0.5,
+        ge=0,
+        description="fitting error below which neighbours of the first frame are merged (equivalent length, spacings)",
+    )
+    size_weight: float = Field(
+        default=0.5, ge=0, description="matching: weight of a size difference against a distance of centres (no unit)"
+    )
+    coherence_weight: float = Field(
+        default=0.0,
+        ge=0,
+        description="matching: weight of neighbours that move differently against a distance of centres (no unit)",
+    )
+    body_deviations: float = Field(
+        default=0.75,
+        description="paths closer than this many standard deviations below the mean of the logarithms belong to one "
+        "body; larger: more bodies (no unit)",
+    )
+    iterative: bool = Field(
+        default=False, description="take the largest body out and repeat on each isolated rest, for noisy volumes"
+    )
