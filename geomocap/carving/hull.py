@@ -35,14 +35,11 @@ def hull(views: PinholeViews, grid: Grid, settings: HullSettings = _DEFAULT) -> 
     """
     unseen = settings.outside == "unseen"
     occupancy = Occupancy.empty(grid.shape)
-    C = len(views)
-    subject = _integral(views.masks)
-    seen = _integral(views.valid) if unseen else subject
-    far = np.append(np.maximum(np.abs(grid.low), np.abs(grid.high)), 1.0)
-    size = np.abs(views.projections) @ far  # (C, 3): largest possible sums, for the rounding error
+    subject = summed(views.masks)
+    seen = summed(views.valid) if unseen else subject
     _carve(
         views.projections,
-        np.column_stack([size[:, :2].max(axis=1), size[:, 2]]).reshape(C, 2),
+        rounding_bounds(views, grid),
         views.masks,
         views.valid,
         subject,
@@ -82,8 +79,18 @@ def hull_surface(views: PinholeViews, grid: Grid, settings: HullSettings = _DEFA
     return hull(views, grid, settings).surface_indices()
 
 
+def rounding_bounds(views: PinholeViews, grid: Grid) -> np.ndarray:
+    """Largest sums of magnitudes in the projections of a grid's points: (C, 2) float, numerators and depth.
+
+    Rounding errors of the projections are a few units in the last place of these.
+    """
+    far = np.append(np.maximum(np.abs(grid.low), np.abs(grid.high)), 1.0)
+    sums = np.abs(views.projections) @ far
+    return np.column_stack([sums[:, :2].max(axis=1), sums[:, 2]])
+
+
 @njit(cache=True, nogil=True, parallel=True)
-def _integral(masks):
+def summed(masks):
     """Summed-area tables (C, H + 1, W + 1) int32 of masks (C, H, W) of 0 and 1."""
     C, H, W = masks.shape
     out = np.empty((C, H + 1, W + 1), np.int32)

@@ -67,7 +67,7 @@ class PinholeViews:
         seen = pad([(v != 0).view(np.uint8) for v in region])
         inside = pad([(m != 0).view(np.uint8) for m in masks])
         inside &= seen
-        return cls(tuple(names or (f"camera {c}" for c in range(len(masks)))), np.asarray(projections), inside, seen)
+        return cls(tuple(names or (str(c) for c in range(len(masks)))), np.asarray(projections), inside, seen)
 
     def without(self, camera: int) -> PinholeViews:
         """Return the views of all other cameras."""
@@ -180,8 +180,8 @@ def _unfolded(map_x: np.ndarray, map_y: np.ndarray, cx: float, cy: float) -> np.
     """Where a distortion polynomial is still one-to-one: the region round the principal point with positive area."""
     xv, xu = np.gradient(map_x.astype(np.float64))
     yv, yu = np.gradient(map_y.astype(np.float64))
-    upright = xu * yv - xv * yu > 0
-    labels = label(upright)[0]
+    upright = np.asarray(xu * yv - xv * yu > 0)
+    labels = np.asarray(label(upright)[0])
     h, w = upright.shape
     center = labels[min(max(int(cy), 0), h - 1), min(max(int(cx), 0), w - 1)]
     return (labels == center) & upright

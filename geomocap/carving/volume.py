@@ -1,0 +1,54 @@
+"""The working volume of a sequence: given, or found from the cameras and the silhouettes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import count
+
+import numpy as np
+
+from geomocap.carving.agreement import check_agreement, check_silhouettes
+from geomocap.carving.bounds import subject_box
+from geomocap.carving.grid import Grid
+from geomocap.carving.settings import CarvingSettings
+from geomocap.carving.views import PinholeViews
+from geomocap.errors import GeometryError
+
+_DEFAULT = CarvingSettings()
+
+
+def working_volume(
+    frames: Iterable[PinholeViews], settings: CarvingSettings = _DEFAULT, numbers: Iterable[int] | None = None
+) -> Grid:
+    """Find the grid that holds the subject in all these frames, or make the one that the settings give.
+
+    Parameters
+    ----------
+    frames : iterable of PinholeViews
+        All frames or a sample spread over the sequence; read one by one.
+    settings : CarvingSettings
+    numbers : iterable of int, optional
+        Frame numbers for messages; 0, 1 … if not given.
+
+    Raises
+    ------
+    GeometryError
+        If silhouettes are empty or have no common volume (the camera that contradicts the others is named), or if
+        the cameras, all on one side, don't bound the subject.
+    """
+    if settings.volume is not None:
+        low, high = (np.array(corner, dtype=np.float64) for corner in settings.volume)
+        return Grid.of_box(low, high, resolution=settings.resolution, voxel_size=settings.voxel_size)
+    box: tuple[np.ndarray, np.ndarray] | None = None
+    for number, views in zip(count() if numbers is None else numbers, frames, strict=False):
+        check_silhouettes(views, number, settings.hull.tolerance)
+        found = subject_box(views, settings.hull)
+        if box is None or found is None:
+            check_agreement(views, number, settings.hull)
+        if found is None:
+            continue
+        box = found if box is None else (np.minimum(box[0], found[0]), np.maximum(box[1], found[1]))
+    if box is None:
+        raise GeometryError("no frames to find the working volume from; give `carving.volume`")
+    margin = settings.margin * (box[1] - box[0]).max()
+    return Grid.of_box(box[0] - margin, box[1] + margin, resolution=settings.resolution, voxel_size=settings.voxel_size)
