@@ -74,12 +74,12 @@ def markers_from_run(
     names: Names | None = None,
     up: Axis = "z",
 ) -> Markers:
-    """Gather a run's joints, key-points and ellipsoid centres as markers.
+    """Gather a run's joints, key-points and ellipsoid centres as markers; the bodies' centres if it has none.
 
     Parameters
     ----------
     skeleton, ellipsoids, keypoints : mapping
-        Arrays of `skeleton.npz`, `ellipsoids.npz`, `keypoints.npz`. Fitting errors of ellipsoids become residuals.
+        Arrays of `skeleton.npz`, `ellipsoids.npz`, `keypoints.npz`.
     names : Names, optional
         The user's names.
     up : "x", "y" or "z"
@@ -92,18 +92,18 @@ def markers_from_run(
     labels = list(names.joint_names(joint_bodies, body_names, _texts(skeleton, "joint_names")))
     told = [f"joint between {body_names[a]} and {body_names[b]}" for a, b in joint_bodies]
     positions = [joints.reshape(n_frames, -1, 3)]
-    residuals = [np.full((n_frames, len(labels)), np.nan)]
     if keypoints is not None:
         labels += [str(n) for n in keypoints["names"]]
         told += [f"key-point, radius {r * 1000:.0f} mm" for r in keypoints["radius"]]
         positions.append(keypoints["positions"])
-        residuals.append(np.full(keypoints["positions"].shape[:2], np.nan))
     if ellipsoids is not None:
         bodies = [body_names[b] if 0 <= b < n_bodies else "no body" for b in ellipsoids["body"].astype(int)]
         labels += [f"ellipsoid{k:03d}" for k in range(len(bodies))]
         told += [f"centre of an ellipsoid of {b}" for b in bodies]
         positions.append(ellipsoids["centers"])
-        residuals.append(np.full(ellipsoids["centers"].shape[:2], np.nan))
+    if not labels:
+        labels, told = list(body_names), ["centre of a body"] * n_bodies
+        positions = [np.asarray(skeleton["body_positions"])]
     lengths = {len(p) for p in positions}
     if len(lengths) > 1:
         raise MotionError(f"skeleton, key-points and ellipsoids have {sorted(lengths)} frames; run the stages again")
@@ -112,8 +112,7 @@ def markers_from_run(
         np.concatenate(positions, axis=1).astype(float),
         float(skeleton["fps"]),
         up,
-        np.concatenate(residuals, axis=1),
-        tuple(told),
+        descriptions=tuple(told),
     )
 
 

@@ -1,0 +1,155 @@
+"""All motion files of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from geomocap.errors import RunError
+from geomocap.export.bvh import write_bvh
+from geomocap.export.c3d import write_c3d
+from geomocap.export.conventions import Axis
+from geomocap.export.errors import MissingPackageError, MotionError
+from geomocap.export.gltf import write_glb
+from geomocap.export.markers import Markers, markers_from_run
+from geomocap.export.motion import Motion
+from geomocap.export.names import Names
+from geomocap.export.settings import ExportSettings
+from geomocap.export.skeleton_motion import motion_from_skeleton
+from geomocap.export.skin import skin_from_run
+from geomocap.export.skinned_mesh import SkinnedMesh
+from geomocap.export.tables import motion_table, write_csv, write_parquet
+from geomocap.export.trc import write_trc
+from geomocap.export.usd import write_usd
+from geomocap.progress import Progress, silent
+from geomocap.run import Run
+
+FILES = {
+    "bvh": "motion.bvh",
+    "trc": "motion.trc",
+    "c3d": "motion.c3d",
+    "glb": "motion.glb",
+    "usd": "motion.usdc",
+    "csv": "motion.csv",
+    "parquet": "motion.parquet",
+}
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written.
+
+    Attributes
+    ----------
+    files : dict of format to path
+    skipped : dict of format to reason
+        Formats that were not asked for by name and could not be written.
+    deviation_mm : float
+        Largest distance of the files' joints from those of `skeleton.npz`.
+    moving_joints : tuple of str
+        Nodes that shift against their parents, because their joints are not fixed in the bodies.
+    """
+
+    files: dict[str, Path]
+    skipped: dict[str, str] = field(default_factory=dict)
+    deviation_mm: float = 0.0
+    moving_joints: tuple[str, ...] = ()
+
+
+def export_run(
+    run: Run,
+    formats: Sequence[str] | None = None,
+    settings: ExportSettings | None = None,
+    *,
+    names: Names | None = None,
+    folder: Path | None = None,
+    progress: Progress = silent,
+) -> Exported:
+    """Write the motion files of a run, each whole or not at all.
+
+    Parameters
+    ----------
+    run : Run
+        With `skeleton.npz`.
+    formats : sequence of str, optional
+        Of bvh, trc, c3d, glb, usd, csv, parquet. By default all whose packages are installed.
+    settings : ExportSettings, optional
+    names : Names, optional
+        The user's names; by default those of `RUN/names.toml` if it is there.
+    folder : Path, optional
+        Where to write; by default the run.
+    progress : Progress
+
+    Raises
+    ------
+    MotionError
+        If a format that was asked for can't be written, or the skeleton can't be used.
+    RunError
+        If there is no skeleton.
+    """
+    settings = settings or ExportSettings()
+    unknown = sorted(set(formats or ()) - set(FILES))
+    if unknown:
+        raise MotionError(f"{unknown[0]}: no motion format; expected one of {', '.join(FILES)}")
+    skeleton = run.read_npz("skeleton.npz")
+    if names is None and (run.path / "names.toml").is_file():
+        names = Names.read(run.path / "names.toml")
+    up = run_up(run)
+    motion = motion_from_skeleton(
+        skeleton, up=up, names=names, joints=settings.joints, source=str(run.path / "skeleton.npz")
+    )
+    markers = run_markers(run, skeleton, names, up, ellipsoids=settings.ellipsoids)
+    mesh = skin_from_run(run, motion, settings) if settings.surface == "skin" else None
+    writers = _writers(motion, markers, mesh, settings)
+    files, skipped = {}, {}
+    chosen = list(formats) if formats is not None else list(FILES)
+    for k, name in enumerate(chosen):
+        path = (folder or run.path) / FILES[name]
+        try:
+            writers[name](path)
+            files[name] = path
+        except MissingPackageError as error:
+            if formats is not None:
+                raise
+            skipped[name] = str(error)
+        progress("export", k + 1, len(chosen))
+    shifting = tuple(n for n, m, j in zip(motion.names, motion.moving, motion.joints, strict=True) if m and j >= 0)
+    return Exported(files, skipped, motion.largest_deviation_mm(skeleton["joint_positions"]), shifting)
+
+
+def run_up(run: Run) -> Axis:
+    """Return the world axis of a run that points up, as its record says; z if there is no record."""
+    try:
+        up = run.read_record().get("source", {}).get("up", "z")
+    except RunError:
+        return "z"
+    axes: dict[str, Axis] = {"x": "x", "y": "y", "z": "z"}
+    if up not in axes:
+        raise MotionError(f"{run.path / 'run.toml'}: source.up is {up!r}; expected x, y or z")
+    return axes[up]
+
+
+def run_markers(
+    run: Run, skeleton: dict[str, np.ndarray], names: Names | None, up: Axis, *, ellipsoids: bool = True
+) -> Markers:
+    """Return a run's joints, key-points and ellipsoid centres as markers; the bodies' centres if it has none."""
+    keypoints = run.read_npz("keypoints.npz") if (run.path / "keypoints.npz").is_file() else None
+    shells = run.read_npz("ellipsoids.npz") if ellipsoids and (run.path / "ellipsoids.npz").is_file() else None
+    return markers_from_run(skeleton, ellipsoids=shells, keypoints=keypoints, names=names, up=up)
+
+
+def _writers(
+    motion: Motion, markers: Markers, mesh: SkinnedMesh | None, settings: ExportSettings
+) -> dict[str, Callable[[Path], None]]:
+    return {
+        "bvh": lambda path: write_bvh(path, motion, unit=settings.bvh_unit),
+        "trc": lambda path: write_trc(path, markers, unit=settings.trc_unit),
+        "c3d": lambda path: write_c3d(path, markers, motion),
+        "glb": lambda path: write_glb(path, motion, mesh),
+        "usd": lambda path: write_usd(path, motion, mesh),
+        "csv": lambda path: write_csv(path, motion_table(markers, motion)),
+        "parquet": lambda path: write_parquet(path, motion_table(markers, motion)),
+    }

@@ -1,0 +1,138 @@
+"""The subject's own surface as a skin: meshed in a reference frame, moved by the bodies that its points belong to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import open3d as o3d
+from scipy import sparse
+from scipy.spatial import cKDTree
+
+from geomocap.export.errors import MotionError
+from geomocap.export.motion import Motion
+from geomocap.export.settings import ExportSettings
+from geomocap.export.skinned_mesh import INFLUENCES, SkinnedMesh
+from geomocap.export.surface import Surface, surface_through
+from geomocap.geometry import Voxels
+from geomocap.run import Run
+
+STEP = 0.5  # of the diffusion: the share of its neighbours' mean that a vertex takes on
+
+
+def skin_from_run(run: Run, motion: Motion, settings: ExportSettings) -> SkinnedMesh:
+    """Mesh a run's surface in the reference frame and bind it to the motion.
+
+    Parameters
+    ----------
+    run : Run
+        With `bodies/`; for true colours with `voxels/` or `cloud/`.
+    motion : Motion
+    settings : ExportSettings
+
+    Raises
+    ------
+    MotionError
+        If the frame has no bodies, or the surface can't be made.
+    """
+    frame = settings.skin_frame
+    file = run.frame_file("bodies", frame)
+    if frame >= motion.n_frames or not file.is_file():
+        raise MotionError(f"{file}: missing; the skin needs a frame that was segmented (--skin_frame)")
+    points, labels, colors, normals = _read_bodies(file)
+    if settings.skin_colors == "true":
+        colors = _true_colors(run, frame, points)
+    surface = surface_through(points, normals, settings.skin_triangles)
+    extent = float(np.ptp(points, axis=0).max())
+    known = labels >= 0
+    nearest = cKDTree(points[known]).query(surface.vertices)[1]
+    nodes, weights = skin_weights(
+        surface, node_of_body(motion, labels[known])[nearest], motion.n_nodes, settings.skin_blend * extent
+    )
+    tint = colors if settings.skin_colors == "true" else colors[known]
+    near = cKDTree(points).query(surface.vertices)[1] if settings.skin_colors == "true" else nearest
+    return SkinnedMesh(surface.vertices, surface.normals, surface.triangles, tint[near], nodes, weights, frame)
+
+
+def skin_weights(surface: Surface, node: np.ndarray, n_nodes: int, blend: float) -> tuple[np.ndarray, np.ndarray]:
+    """Weights that fall off smoothly where two bodies meet, by diffusion of the labels over the surface.
+
+    On a mesh of edge e, a step of half the neighbours' mean spreads by e²/4 in variance, so `blend` metres take
+    4 (blend / e)² steps. Diffusion runs along the surface: a hand that rests on a thigh doesn't pull at it.
+
+    Parameters
+    ----------
+    surface : Surface
+    node : (V,) int
+        Node that each vertex belongs to.
+    n_nodes : int
+    blend : float, metres
+        Standard deviation of the blending.
+
+    Returns
+    -------
+    nodes : (V, 4) int
+    weights : (V, 4) float
+        The four largest, summing to one.
+    """
+    f, v = surface.triangles, len(surface.vertices)
+    edges = np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
+    length = float(np.linalg.norm(np.diff(surface.vertices[edges], axis=1), axis=-1).mean())
+    both = np.concatenate([edges, edges[:, ::-1]])
+    adjacent = sparse.csr_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(v, v))
+    adjacent.data[:] = 1
+    degree = np.maximum(np.asarray(adjacent.sum(axis=1)).ravel(), 1)
+    step = sparse.diags(1 / degree) @ adjacent * STEP + sparse.eye(v) * (1 - STEP)
+    weight = np.zeros((v, n_nodes))
+    weight[np.arange(v), node] = 1
+    for _ in range(int(np.ceil(4 * (blend / length) ** 2))):
+        weight = step @ weight
+    most = min(INFLUENCES, n_nodes)
+    nodes, weights = np.zeros((v, INFLUENCES), int), np.zeros((v, INFLUENCES))
+    nodes[:, :most] = np.argsort(-weight, axis=1, kind="stable")[:, :most]
+    weights[:, :most] = np.take_along_axis(weight, nodes[:, :most], axis=1)
+    weights[weights < 0.01 * weights[:, :1]] = 0
+    return nodes, weights / weights.sum(axis=1, keepdims=True)
+
+
+def node_of_body(motion: Motion, bodies: np.ndarray) -> np.ndarray:
+    """Nodes of the motion that are these bodies, (N,) int."""
+    table = np.full(max(int(motion.bodies.max()), int(bodies.max(initial=0))) + 1, -1)
+    table[motion.bodies[motion.bodies >= 0]] = np.flatnonzero(motion.bodies >= 0)
+    nodes = table[bodies]
+    if (nodes < 0).any():
+        raise MotionError(f"skin: body {int(bodies[nodes < 0][0])} has points but no place in skeleton.npz; run again")
+    return nodes
+
+
+def _read_bodies(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+    cloud = o3d.t.io.read_point_cloud(file)
+    if "positions" not in cloud.point or "body" not in cloud.point:
+        raise MotionError(f"{file}: no points with the attribute body; delete it and run again")
+    points = cloud.point.positions.numpy().astype(float)
+    labels = cloud.point["body"].numpy().ravel().astype(int)
+    if not (labels >= 0).any():
+        raise MotionError(f"{file}: no point belongs to a body; choose another reference frame (--skin_frame)")
+    colors = _bytes(cloud.point.colors.numpy()) if "colors" in cloud.point else np.full((len(points), 3), 200, np.uint8)
+    normals = cloud.point.normals.numpy().astype(float) if "normals" in cloud.point else None
+    return points, labels, colors, normals
+
+
+def _true_colors(run: Run, frame: int, points: np.ndarray) -> np.ndarray:
+    """Colours of the nearest voxels, or cloud points, of the frame: (N, 3) uint8."""
+    kind: Literal["voxels", "cloud"] = "voxels" if run.frame_file("voxels", frame).is_file() else "cloud"
+    file = run.frame_file(kind, frame)
+    if kind == "voxels":
+        voxels = Voxels.read(file)
+        places, colors = voxels.points, voxels.colors
+    else:
+        cloud = o3d.t.io.read_point_cloud(file) if file.is_file() else o3d.t.geometry.PointCloud()
+        if "positions" not in cloud.point or "colors" not in cloud.point:
+            raise MotionError(f'{file}: no colours there; keep skin_colors = "body"')
+        places, colors = cloud.point.positions.numpy(), _bytes(cloud.point.colors.numpy())
+    return colors[cKDTree(places).query(points)[1]]
+
+
+def _bytes(colors: np.ndarray) -> np.ndarray:
+    return colors if colors.dtype == np.uint8 else np.clip(np.rint(colors * 255), 0, 255).astype(np.uint8)

@@ -1,0 +1,109 @@
+import sys
+
+import numpy as np
+import pytest
+
+from geomocap.errors import RunError
+from geomocap.export.errors import MotionError
+from geomocap.export.names import Names
+from geomocap.export.run_export import FILES, export_run
+from geomocap.export.settings import ExportSettings
+from geomocap.export.trc import read_trc
+from geomocap.run import Run
+from tests.geomocap.articulated import skeleton_arrays
+
+
+@pytest.fixture
+def run(tmp_path):
+    run = Run(tmp_path / "run")
+    run.write_npz("skeleton.npz", **skeleton_arrays())
+    run.write_record({"source": {"up": "z"}})
+    return run
+
+
+def test_every_format_whose_package_is_there(run):
+    pytest.importorskip("ezc3d"), pytest.importorskip("pxr"), pytest.importorskip("pyarrow")
+    reports = []
+    exported = export_run(run, progress=lambda *step: reports.append(step))
+    assert set(exported.files) == set(FILES)
+    assert all(file.stat().st_size > 100 for file in exported.files.values())
+    assert exported.deviation_mm < 0.1
+    assert exported.moving_joints == ()
+    assert reports[-1] == ("export", 7, 7)
+    assert not list(run.path.glob(".*.tmp*"))
+
+
+def test_missing_packages_are_skipped_unless_asked_for(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ezc3d", None)
+    exported = export_run(run, settings=ExportSettings(bvh_unit="cm"))
+    assert "c3d" not in exported.files
+    assert exported.skipped["c3d"].endswith('pip install "geomocap[c3d]"')
+    with pytest.raises(MotionError, match=r"geomocap\[c3d\]"):
+        export_run(run, ["c3d"])
+
+
+def test_only_what_was_asked_for_and_elsewhere(run, tmp_path):
+    exported = export_run(run, ["bvh"], folder=tmp_path / "out")
+    assert exported.files == {"bvh": tmp_path / "out" / "motion.bvh"}
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["motion.bvh"]
+    with pytest.raises(MotionError, match="fbx: no motion format; expected one of bvh, trc"):
+        export_run(run, ["fbx"])
+
+
+def test_the_same_run_gives_the_same_files(run, tmp_path):
+    chosen = ["bvh", "trc", "glb", "csv"]
+    first = export_run(run, chosen, folder=tmp_path / "a").files
+    second = export_run(run, chosen, folder=tmp_path / "b").files
+    for name in chosen:
+        assert first[name].read_bytes() == second[name].read_bytes()
+
+
+def test_jumping_joints_are_named(run):
+    run.write_npz("skeleton.npz", **skeleton_arrays(jump_mm=10))
+    moving = export_run(run, ["bvh"])
+    assert len(moving.moving_joints) == 6
+    assert moving.deviation_mm < 1e-6
+    fixed = export_run(run, ["bvh"], ExportSettings(joints="fixed"))
+    assert fixed.moving_joints == ()
+    assert fixed.deviation_mm > 10
+
+
+def test_names_lie_in_the_run_or_are_given(run):
+    (run.path / "names.toml").write_text("hip = 0\n")
+    export_run(run, ["bvh"])
+    assert "ROOT hip\n" in (run.path / "motion.bvh").read_text()
+    export_run(run, ["bvh"], names=Names({0: "pelvis"}))
+    assert "ROOT pelvis\n" in (run.path / "motion.bvh").read_text()
+
+
+def test_key_points_and_ellipsoids_are_markers(run):
+    run.write_npz("keypoints.npz", names=np.array(["hat"]), positions=np.zeros((20, 1, 3)), radius=np.array([0.1]))
+    run.write_npz("ellipsoids.npz", centers=np.zeros((20, 2, 3)), body=np.array([0, 1]))
+    export_run(run, ["trc"])
+    assert read_trc(run.path / "motion.trc").names[-3:] == ("hat", "ellipsoid000", "ellipsoid001")
+    export_run(run, ["trc"], ExportSettings(ellipsoids=False))
+    assert read_trc(run.path / "motion.trc").names[-1] == "hat"
+
+
+def test_one_body_without_joints(tmp_path):
+    run = Run(tmp_path)
+    arrays = skeleton_arrays(n_bodies=1)
+    run.write_npz("skeleton.npz", **arrays)
+    exported = export_run(run, ["bvh", "trc", "glb", "csv"])
+    assert len(exported.files) == 4
+    assert read_trc(tmp_path / "motion.trc").names == ("body00",)
+
+
+def test_up_is_the_captures(run):
+    run.write_record({"source": {"up": "y"}})
+    export_run(run, ["trc"], ExportSettings(trc_unit="m"))
+    positions = skeleton_arrays()["joint_positions"]
+    np.testing.assert_allclose(read_trc(run.path / "motion.trc").positions, positions, atol=1e-6)
+    run.write_record({"source": {"up": "sideways"}})
+    with pytest.raises(MotionError, match=r"source\.up is 'sideways'"):
+        export_run(run, ["trc"])
+
+
+def test_no_skeleton(tmp_path):
+    with pytest.raises(RunError, match=r"skeleton.npz: missing"):
+        export_run(Run(tmp_path))
