@@ -1,0 +1,76 @@
+"""Colours of surface voxels from the cameras that see them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+from scipy.spatial import cKDTree
+
+from geomocap.carving.grid import Grid
+from geomocap.carving.occupancy import Occupancy
+from geomocap.carving.views import PinholeViews
+from geomocap.carving.visibility import normals, sightings
+
+GREY = 160
+
+
+def voxel_colors(
+    views: PinholeViews, images: np.ndarray, grid: Grid, occupancy: Occupancy, surface: np.ndarray
+) -> np.ndarray:
+    """Colour surface voxels by the weighted median of the cameras that see them, (N, 3) uint8, RGB.
+
+    A camera weighs with the squared cosine between its ray and the surface's normal. Voxels that no camera sees take
+    the colour of the nearest one that is seen; if none is seen at all they are grey.
+    """
+    seen = sightings(views, images, grid, surface)
+    centers = -np.linalg.solve(views.projections[:, :, :3], views.projections[:, :, 3:])[:, :, 0]
+    colors = np.full((len(surface), 3), GREY, np.uint8)
+    has_color = np.zeros(len(surface), np.bool_)
+    positions = grid.centers(surface)
+    _blend(seen.seen, seen.colors, positions, normals(occupancy, surface), centers, colors, has_color)
+    if has_color.any() and not has_color.all():
+        nearest = cKDTree(positions[has_color]).query(positions[~has_color])[1]
+        colors[~has_color] = colors[has_color][nearest]
+    return colors
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _blend(seen, samples, positions, normal, centers, colors, has_color):
+    N, C = seen.shape
+    for n in prange(N):
+        weights = np.empty(C, np.float64)
+        values = np.empty(C, np.float64)
+        order = np.empty(C, np.int64)
+        total = 0.0
+        for c in range(C):
+            if seen[n, c]:
+                x, y, z = (
+                    centers[c, 0] - positions[n, 0],
+                    centers[c, 1] - positions[n, 1],
+                    centers[c, 2] - positions[n, 2],
+                )
+                cosine = x * normal[n, 0] + y * normal[n, 1] + z * normal[n, 2]
+                cosine = max(cosine / np.sqrt(x * x + y * y + z * z), 0.05)
+                weights[c] = cosine * cosine
+                total += weights[c]
+        if total == 0.0:
+            continue
+        has_color[n] = True
+        for a in range(3):
+            count = 0
+            for c in range(C):
+                if seen[n, c]:
+                    at = count
+                    while at > 0 and values[at - 1] > samples[n, c, a]:
+                        values[at] = values[at - 1]
+                        order[at] = order[at - 1]
+                        at -= 1
+                    values[at] = samples[n, c, a]
+                    order[at] = c
+                    count += 1
+            part = 0.0
+            for q in range(count):
+                part += weights[order[q]]
+                if part >= 0.5 * total:
+                    colors[n, a] = np.uint8(values[q] + 0.5)
+                    break

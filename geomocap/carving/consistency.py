@@ -1,0 +1,147 @@
+"""Colour consistency: surface voxels go whose colours differ between the cameras that see them.
+
+The visual hull fills what no silhouette shows, as hollows and the space between limbs. A voxel out there is seen by
+cameras that look at different places of the true surface behind it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from geomocap.carving.grid import Grid
+from geomocap.carving.occupancy import Occupancy
+from geomocap.carving.settings import ConsistencySettings
+from geomocap.carving.views import PinholeViews
+from geomocap.carving.visibility import Sightings, sightings
+
+
+def carve_inconsistent(
+    views: PinholeViews, images: np.ndarray, grid: Grid, occupancy: Occupancy, settings: ConsistencySettings
+) -> Occupancy:
+    """Carve inconsistent surface voxels, layer by layer, until nothing changes or `max_passes` is reached.
+
+    Each pass draws the surface anew, so that visibility follows the carving, and takes at most one layer: no hole gets
+    deeper than `max_passes` voxels.
+
+    Parameters
+    ----------
+    views : PinholeViews
+    images : (C, H, W, 3) uint8
+        Undistorted images on the canvas of the views.
+    grid : Grid
+    occupancy : Occupancy
+        The visual hull.
+    settings : ConsistencySettings
+
+    References
+    ----------
+    Kutulakos & Seitz, A theory of shape by space carving, IJCV 38(3), 2000; the window is the shuffle transform of
+    Kutulakos, Approximate N-view stereo, ECCV 2000.
+    """
+    bits = occupancy.bits.copy()
+    gains = None
+    for _ in range(settings.max_passes):
+        surface = Occupancy(bits, occupancy.shape).surface_indices()
+        if len(surface) == 0:
+            break
+        seen = sightings(views, images, grid, surface, settings.window)
+        if gains is None:
+            gains = camera_gains(seen) if settings.gain else np.ones((len(views), 3), np.float32)
+        deviation = color_deviation(seen, gains, settings.min_cameras)
+        judged, bad = np.zeros_like(bits), np.zeros_like(bits)
+        taken = _vote(bits, surface, deviation, settings.threshold, settings.support, judged, bad)
+        if taken == 0:
+            break
+    return Occupancy(bits, occupancy.shape)
+
+
+def camera_gains(seen: Sightings, samples: int = 4000) -> np.ndarray:
+    """Estimate one factor a camera and channel that brings its colours to the middle of all, (C, 3) float32.
+
+    The median over voxels that three or more cameras see of (median colour of the cameras / this camera's colour).
+    """
+    several = np.flatnonzero(seen.seen.sum(axis=1) >= 3)
+    several = several[:: max(1, len(several) // samples)]
+    C = seen.seen.shape[1]
+    gains = np.ones((C, 3), np.float32)
+    if len(several) < 50:
+        return gains
+    colors = np.where(seen.seen[several, :, None] != 0, seen.colors[several], np.nan)
+    middle = np.nanmedian(colors, axis=1)
+    for c in range(C):
+        usable = (seen.seen[several, c] != 0) & (colors[:, c].min(axis=1) > 16)
+        if usable.sum() >= 50:
+            gains[c] = np.clip(np.median(middle[usable] / colors[usable, c], axis=0), 0.5, 2.0)
+    return gains
+
+
+def color_deviation(seen: Sightings, gains: np.ndarray, min_cameras: int) -> np.ndarray:
+    """Standard deviation of a voxel's colours about their median, (N,) float32, grey values; -1 where too few see it.
+
+    A camera whose window holds the median colour counts as deviating by nothing.
+    """
+    out = np.empty(len(seen.seen), np.float32)
+    _deviate(seen.seen, seen.colors, seen.low, seen.high, gains, min_cameras, out)
+    return out
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _deviate(seen, colors, low, high, gains, min_cameras, out):
+    N, C = seen.shape
+    for n in prange(N):
+        values = np.empty(C, np.float32)
+        count = 0
+        total = np.float32(0)
+        for a in range(3):
+            count = 0
+            for c in range(C):
+                if seen[n, c]:
+                    # insertion sort: few values
+                    value = colors[n, c, a] * gains[c, a]
+                    at = count
+                    while at > 0 and values[at - 1] > value:
+                        values[at] = values[at - 1]
+                        at -= 1
+                    values[at] = value
+                    count += 1
+            if count < min_cameras:
+                break
+            middle = np.float32(0.5) * (values[(count - 1) // 2] + values[count // 2])
+            for c in range(C):
+                if seen[n, c]:
+                    below = low[n, c, a] * gains[c, a] - middle
+                    above = middle - high[n, c, a] * gains[c, a]
+                    off = max(below, above, np.float32(0))
+                    total += off * off
+        out[n] = np.sqrt(total / (3 * count)) if count >= min_cameras else np.float32(-1)
+
+
+@njit(cache=True, nogil=True)
+def _vote(bits, surface, deviation, threshold, support, judged, bad):
+    """Take from `bits` the inconsistent voxels whose surroundings (5³) are inconsistent too; return how many."""
+    X, Y, K = bits.shape
+    for n in range(len(surface)):
+        i, j, k = surface[n, 0], surface[n, 1], surface[n, 2]
+        bit = np.uint32(1 << (k & 31))
+        if deviation[n] >= 0:
+            judged[i, j, k >> 5] |= bit
+            if deviation[n] > threshold:
+                bad[i, j, k >> 5] |= bit
+    taken = 0
+    for n in range(len(surface)):
+        if deviation[n] <= threshold:
+            continue
+        i, j, k = surface[n, 0], surface[n, 1], surface[n, 2]
+        n_judged, n_bad = 0, 0
+        for a in range(max(i - 2, 0), min(i + 3, X)):
+            for b in range(max(j - 2, 0), min(j + 3, Y)):
+                for z in range(max(k - 2, 0), min(k + 3, 32 * K)):
+                    shift = np.uint32(z & 31)
+                    if (judged[a, b, z >> 5] >> shift) & np.uint32(1):
+                        n_judged += 1
+                        n_bad += (bad[a, b, z >> 5] >> shift) & np.uint32(1)
+        if n_bad >= support * n_judged:
+            bits[i, j, k >> 5] &= ~np.uint32(1 << (k & 31))
+            taken += 1
+    return taken

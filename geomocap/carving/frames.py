@@ -1,0 +1,74 @@
+"""From the silhouettes of one frame to its coloured surface voxels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geomocap.carving.agreement import check_agreement, check_inside, check_silhouettes
+from geomocap.carving.coloring import GREY, voxel_colors
+from geomocap.carving.consistency import carve_inconsistent
+from geomocap.carving.grid import Grid
+from geomocap.carving.hull import hull
+from geomocap.carving.settings import CarvingSettings
+from geomocap.carving.views import PinholeViews
+from geomocap.geometry import Voxels
+
+_DEFAULT = CarvingSettings()
+
+
+def carve_frame(
+    views: PinholeViews,
+    grid: Grid,
+    settings: CarvingSettings = _DEFAULT,
+    images: np.ndarray | None = None,
+    frame: int = 0,
+) -> Voxels:
+    """Carve one frame.
+
+    Parameters
+    ----------
+    views : PinholeViews
+        Undistorted silhouettes.
+    grid : Grid
+        The working volume.
+    settings : CarvingSettings
+    images : (C, H, W, 3) uint8, optional
+        Undistorted images on the canvas of the views, from `Undistortion.images`; without them there are no colours
+        and no colour consistency. `needs_images` says whether the settings want them.
+    frame : int
+        For messages.
+
+    Returns
+    -------
+    Voxels
+        Surface voxels, sorted by x, y, z index.
+
+    Raises
+    ------
+    GeometryError
+        If a silhouette is empty, the silhouettes contradict each other, or the subject is outside the volume.
+    """
+    check_silhouettes(views, frame, settings.hull.tolerance)
+
+    # Shape from silhouette
+    occupancy = hull(views, grid, settings.hull)
+    surface = occupancy.surface_indices()
+    if len(surface) == 0:
+        check_agreement(views, frame, settings.hull)
+    check_inside(surface, grid, frame, settings.max_cut)
+
+    # Colour consistency over the cameras that see a surface voxel
+    if images is not None and settings.consistency.enabled:
+        occupancy = carve_inconsistent(views, images, grid, occupancy, settings.consistency)
+        surface = occupancy.surface_indices()
+
+    if images is not None and settings.colors == "visible":
+        colors = voxel_colors(views, images, grid, occupancy, surface)
+    else:
+        colors = np.full((len(surface), 3), GREY, np.uint8)
+    return Voxels(surface, colors, grid.origin, grid.voxel_size)
+
+
+def needs_images(settings: CarvingSettings) -> bool:
+    """Whether these settings use the images, not only the silhouettes."""
+    return settings.consistency.enabled or settings.colors == "visible"

@@ -1,0 +1,193 @@
+"""Which camera sees which surface voxel, and the colour that it sees there.
+
+Surface voxels are drawn into one depth buffer a camera, each as the rectangle round its projected cube. A voxel is seen
+where nothing lies clearly before its centre.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+
+from geomocap.carving.grid import Grid
+from geomocap.carving.occupancy import Occupancy
+from geomocap.carving.views import PinholeViews
+
+DEPTH_SLACK = 1.5  # voxels that something must lie before a centre to hide it: a slanted surface doesn't hide itself
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """What the cameras see of surface voxels.
+
+    Attributes
+    ----------
+    seen : (N, C) uint8
+        1 where the camera sees the voxel.
+    colors : (N, C, 3) float32
+        Mean colour of the subject's pixels under the voxel; 0 where it is not seen.
+    low, high : (N, C, 3) uint8
+        Range of the colours within the window round it.
+    """
+
+    seen: np.ndarray
+    colors: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def depth_buffers(views: PinholeViews, grid: Grid, surface: np.ndarray) -> np.ndarray:
+    """Draw surface voxels (N, 3) as cubes: depth of the nearest, (C, H, W) float32, metres; inf where none is."""
+    depth = np.full(views.masks.shape, np.inf, np.float32)
+    _draw(views.projections, np.ascontiguousarray(surface, np.int32), grid.origin, grid.voxel_size, depth)
+    return depth
+
+
+def sightings(views: PinholeViews, images: np.ndarray, grid: Grid, surface: np.ndarray, window: int = 0) -> Sightings:
+    """Find which cameras see each surface voxel and with which colour.
+
+    Parameters
+    ----------
+    views : PinholeViews
+    images : (C, H, W, 3) uint8
+        Undistorted images on the canvas of the views.
+    grid : Grid
+    surface : (N, 3) int
+        All surface voxels: they hide each other.
+    window : int
+        Radius of the window of `low` and `high`, pixels; 0: the voxel's own pixels.
+    """
+    depth = depth_buffers(views, grid, surface)
+    N, C = len(surface), len(views)
+    seen = np.zeros((N, C), np.uint8)
+    colors = np.zeros((N, C, 3), np.float32)
+    low, high = np.zeros((N, C, 3), np.uint8), np.zeros((N, C, 3), np.uint8)
+    _look(
+        views.projections,
+        views.masks,
+        views.valid,
+        images,
+        depth,
+        np.ascontiguousarray(surface, np.int32),
+        grid.origin,
+        grid.voxel_size,
+        DEPTH_SLACK * grid.voxel_size,
+        window,
+        seen,
+        colors,
+        low,
+        high,
+    )
+    return Sightings(seen, colors, low, high)
+
+
+def normals(occupancy: Occupancy, surface: np.ndarray) -> np.ndarray:
+    """Outward directions at surface voxels (N, 3), away from the occupied voxels within two: (N, 3) float32, unit."""
+    n = _away(occupancy.bits, np.ascontiguousarray(surface, np.int32))
+    return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-6)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _draw(P, surface, origin, edge, depth):
+    C, H, W = depth.shape
+    half = 0.5 * edge
+    for c in prange(C):
+        for n in range(len(surface)):
+            x = origin[0] + (surface[n, 0] + 0.5) * edge
+            y = origin[1] + (surface[n, 1] + 0.5) * edge
+            z = origin[2] + (surface[n, 2] + 0.5) * edge
+            w = P[c, 2, 0] * x + P[c, 2, 1] * y + P[c, 2, 2] * z + P[c, 2, 3]
+            if w <= edge:
+                continue
+            u = (P[c, 0, 0] * x + P[c, 0, 1] * y + P[c, 0, 2] * z + P[c, 0, 3]) / w
+            v = (P[c, 1, 0] * x + P[c, 1, 1] * y + P[c, 1, 2] * z + P[c, 1, 3]) / w
+            du, dv = 0.0, 0.0
+            for a in range(3):
+                du += abs(P[c, 0, a] - u * P[c, 2, a])
+                dv += abs(P[c, 1, a] - v * P[c, 2, a])
+            du *= half / w
+            dv *= half / w
+            if u + du < 0 or v + dv < 0 or u - du >= W or v - dv >= H:
+                continue
+            # pixels whose centres lie in the rectangle, and the one that holds the voxel's centre
+            u0, u1 = min(int(np.ceil(u - du - 0.5)), int(np.floor(u))), max(int(u + du - 0.5), int(np.floor(u)))
+            v0, v1 = min(int(np.ceil(v - dv - 0.5)), int(np.floor(v))), max(int(v + dv - 0.5), int(np.floor(v)))
+            d = np.float32(w)
+            for row in range(max(v0, 0), min(v1, H - 1) + 1):
+                for column in range(max(u0, 0), min(u1, W - 1) + 1):
+                    if d < depth[c, row, column]:
+                        depth[c, row, column] = d
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _look(P, masks, valid, images, depth, surface, origin, edge, slack, window, seen, colors, low, high):
+    C, H, W = masks.shape
+    half = 0.5 * edge
+    for n in prange(len(surface)):
+        x = origin[0] + (surface[n, 0] + 0.5) * edge
+        y = origin[1] + (surface[n, 1] + 0.5) * edge
+        z = origin[2] + (surface[n, 2] + 0.5) * edge
+        for c in range(C):
+            w = P[c, 2, 0] * x + P[c, 2, 1] * y + P[c, 2, 2] * z + P[c, 2, 3]
+            if w <= edge:
+                continue
+            u = (P[c, 0, 0] * x + P[c, 0, 1] * y + P[c, 0, 2] * z + P[c, 0, 3]) / w
+            v = (P[c, 1, 0] * x + P[c, 1, 1] * y + P[c, 1, 2] * z + P[c, 1, 3]) / w
+            if not (u >= 0 and v >= 0 and u < W and v < H):
+                continue
+            iu, iv = int(u), int(v)
+            if valid[c, iv, iu] == 0 or w > depth[c, iv, iu] + slack:
+                continue
+            seen[n, c] = 1
+            # mean colour under the voxel's own square, range of colours in the window
+            reach = half * np.sqrt(P[c, 0, 0] ** 2 + P[c, 0, 1] ** 2 + P[c, 0, 2] ** 2) / w
+            reach = min(reach, 4.0)
+            own_u0, own_u1 = int(np.floor(u - reach)), int(np.floor(u + reach))
+            own_v0, own_v1 = int(np.floor(v - reach)), int(np.floor(v + reach))
+            r = g = b = 0
+            count = 0
+            r0 = g0 = b0 = np.uint8(255)
+            r1 = g1 = b1 = np.uint8(0)
+            u0, u1 = max(min(iu - window, own_u0), 0), min(max(iu + window, own_u1), W - 1)
+            v0, v1 = max(min(iv - window, own_v0), 0), min(max(iv + window, own_v1), H - 1)
+            for row in range(v0, v1 + 1):
+                for column in range(u0, u1 + 1):
+                    if masks[c, row, column] == 0 and not (row == iv and column == iu):
+                        continue
+                    red, green, blue = images[c, row, column, 0], images[c, row, column, 1], images[c, row, column, 2]
+                    r0, r1 = min(r0, red), max(r1, red)
+                    g0, g1 = min(g0, green), max(g1, green)
+                    b0, b1 = min(b0, blue), max(b1, blue)
+                    if own_v0 <= row <= own_v1 and own_u0 <= column <= own_u1:
+                        r += red
+                        g += green
+                        b += blue
+                        count += 1
+            colors[n, c, 0] = r / count
+            colors[n, c, 1] = g / count
+            colors[n, c, 2] = b / count
+            low[n, c, 0], low[n, c, 1], low[n, c, 2] = r0, g0, b0
+            high[n, c, 0], high[n, c, 1], high[n, c, 2] = r1, g1, b1
+
+
+@njit(cache=True, nogil=True)
+def _away(bits, surface):
+    X, Y, K = bits.shape
+    out = np.zeros((len(surface), 3), np.float32)
+    for n in range(len(surface)):
+        i, j, k = surface[n, 0], surface[n, 1], surface[n, 2]
+        for a in range(-2, 3):
+            for b in range(-2, 3):
+                if not (0 <= i + a < X and 0 <= j + b < Y):
+                    continue
+                for c in range(-2, 3):
+                    z = k + c
+                    if z < 0 or z >= 32 * K:
+                        continue
+                    if (bits[i + a, j + b, z >> 5] >> np.uint32(z & 31)) & np.uint32(1):
+                        out[n, 0] -= a
+                        out[n, 1] -= b
+                        out[n, 2] -= c
+    return out
