@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -53,20 +52,24 @@ def floor(stage: Stage, view: PinholeView, meshes: Sequence[Mesh] = (), center: 
     origin = basis @ base
     reach = max(0.75 * stage.extent, 2 * step)
     first, last = np.floor((origin - reach) / step), np.ceil((origin + reach) / step)
+    segments = []
     for k in range(2):
+        along = np.linspace(first[1 - k], last[1 - k], 33) * step
         for i in np.arange(first[k], last[k] + 1) * step:
-            ends = np.array([first[1 - k], last[1 - k]]) * step
-            flat = np.column_stack([np.full(33, i), np.linspace(ends[0], ends[1], 33)])[:, [0, 1] if k == 0 else [1, 0]]
-            _line(image, view, base + (flat - origin) @ basis, scale)
+            flat = np.column_stack([np.full(33, i), along])[:, [0, 1] if k == 0 else [1, 0]]
+            segments.append(np.stack([flat[:-1], flat[1:]], axis=1))
+    flat = np.concatenate(segments).reshape(-1, 2)
+    _lines(image, view, base + (flat - origin) @ basis, scale)
     return cv2.resize(np.clip(image, 0, 255).astype(np.uint8), (width, height), interpolation=cv2.INTER_AREA)
 
 
-def _line(image: np.ndarray, view: PinholeView, points: np.ndarray, scale: int) -> None:
-    pixels, _ = view.project(points)
-    for a, b in pairwise(pixels):
-        if np.isfinite([a, b]).all() and np.abs([a, b]).max() < 1e4:
-            start, end = (tuple(int(v) for v in np.rint((p * scale - 0.5) * 16)) for p in (a, b))
-            cv2.line(image, start, end, LINE, 1, cv2.LINE_AA, 4)
+def _lines(image: np.ndarray, view: PinholeView, points: np.ndarray, scale: int) -> None:
+    """Draw segments between each two of the points (2 N, 3) that lie in front of the view."""
+    pixels = view.project(points)[0].reshape(-1, 2, 2)
+    near = np.isfinite(pixels).all(axis=(1, 2))
+    near[near] = (np.abs(pixels[near]) < 1e4).all(axis=(1, 2))
+    ends = np.rint((pixels[near] * scale - 0.5) * 16).astype(np.int32)
+    cv2.polylines(image, list(ends), False, LINE, 1, cv2.LINE_AA, 4)
 
 
 def _shadow(

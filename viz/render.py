@@ -74,7 +74,7 @@ class _Surfaces:
     colors: np.ndarray
     alpha: np.ndarray
     rim: np.ndarray
-    group: np.ndarray
+    label: np.ndarray  # of mesh and colour; 0 where no outline is wanted
 
 
 def _surfaces(meshes: Sequence[Mesh]) -> _Surfaces | None:
@@ -94,8 +94,15 @@ def _surfaces(meshes: Sequence[Mesh]) -> _Surfaces | None:
         np.concatenate([m.colors for m in meshes]).astype(np.float32),
         np.repeat([m.alpha for m in meshes], sizes).astype(np.float32),
         np.repeat([m.rim for m in meshes], sizes).astype(np.float32),
-        np.repeat([k + 1 if m.outlined else 0 for k, m in enumerate(meshes)], sizes).astype(np.int32),
+        np.concatenate([_labels(k, m) for k, m in enumerate(meshes)]),
     )
+
+
+def _labels(number: int, mesh: Mesh) -> np.ndarray:
+    """One number for each mesh and colour, (F,) int64."""
+    if not mesh.outlined:
+        return np.zeros(len(mesh.faces), np.int64)
+    return ((np.rint(mesh.colors * 255).astype(np.int64) @ [1 << 16, 1 << 8, 1]) << 16) + number + 1
 
 
 def render(meshes: Sequence[Mesh], view: View, look: Look | None = None, up: np.ndarray | None = None) -> Layer:
@@ -132,8 +139,7 @@ def render(meshes: Sequence[Mesh], view: View, look: Look | None = None, up: np.
     near = _opaque(_surfaces([m for m in meshes if m.alpha >= 1]), origin, directions, shape, look, up)
     clear = _surfaces([m for m in meshes if m.alpha < 1])
     rgba = near.rgba if clear is None else _peel(clear, origin, directions, near, look, up)
-    small = rgba.reshape(bottom - top, s, right - left, s, 4).mean(axis=(1, 3))
-    result[top:bottom, left:right] = small
+    result[top:bottom, left:right] = cv2.resize(rgba, (right - left, bottom - top), interpolation=cv2.INTER_AREA)
     return Layer(result)
 
 
@@ -177,7 +183,7 @@ def _normals(surfaces: _Surfaces, triangle: np.ndarray, uv: np.ndarray, directio
     u, v = uv[:, :1], uv[:, 1:]
     n = (1 - u - v) * surfaces.normals[corner[:, 0]]
     n += u * surfaces.normals[corner[:, 1]] + v * surfaces.normals[corner[:, 2]]
-    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9)
+    n /= np.maximum(np.sqrt(np.einsum("ij,ij->i", n, n)), 1e-9)[:, None]
     away = np.einsum("ij,ij->i", n, directions) > 0
     n[away] *= -1
     return n
@@ -198,7 +204,7 @@ def _shade(albedo: np.ndarray, normals: np.ndarray, directions: np.ndarray, up: 
     facing = np.clip(-np.einsum("ij,ij->i", normals, directions), 0, 1)
     sky = 0.5 + 0.5 * (normals @ above.astype(np.float32))
     half = key - directions
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    half /= np.sqrt(np.einsum("ij,ij->i", half, half))[:, None]
     shine = np.clip(np.einsum("ij,ij->i", normals, half), 0, 1) ** 40
     light = 0.30 + 0.16 * sky + 0.20 * facing + 0.44 * diffuse
     return np.clip(albedo * light[:, None] + 0.10 * shine[:, None], 0, 1)
@@ -224,11 +230,9 @@ def _opaque(
         color = _shade(surfaces.colors[triangle], normals, d, up)
         depth_map = distance.reshape(shape)
         shadow = look.hollows * _hollows(depth_map, look.samples)[hit.reshape(shape)]
-        group = np.zeros(len(directions), np.int32)
-        group[hit] = surfaces.group[triangle]
-        tint = np.zeros((len(directions), 3), np.float32)
-        tint[hit] = surfaces.colors[triangle]
-        line = look.outline * _edges(depth_map, group.reshape(shape), tint.reshape(*shape, 3))[hit.reshape(shape)]
+        label = np.zeros(len(directions), np.int64)
+        label[hit] = surfaces.label[triangle]
+        line = look.outline * _edges(depth_map, label.reshape(shape))[hit.reshape(shape)]
         rgba[hit, :3] = color * (1 - shadow)[:, None] * (1 - line)[:, None]
         rgba[hit, 3] = 1
     return _Near(rgba.reshape(*shape, 4), distance)
@@ -247,21 +251,23 @@ def _hollows(depth: np.ndarray, samples: int) -> np.ndarray:
     return np.clip((filled - blurred) / scale, 0, 1) * hit
 
 
-def _edges(depth: np.ndarray, group: np.ndarray, tint: np.ndarray) -> np.ndarray:
+def _edges(depth: np.ndarray, label: np.ndarray) -> np.ndarray:
     """Darkness, 0–1, of samples beside which an outlined surface ends, lies deeper, or changes its colour."""
     hit = np.isfinite(depth)
     values = depth[hit]
-    jump = 0.03 * max(float(np.ptp(values)), 0.02 * float(values.mean()), 1e-6)
+    jump = np.float32(0.03 * max(float(np.ptp(values)), 0.02 * float(values.mean()), 1e-6))
     far = np.where(hit, depth, np.float32(1e9))
     dark = np.zeros(depth.shape, np.float32)
-    outlined = group > 0
     for axis in (0, 1):
-        for step in (1, -1):
-            deeper = np.roll(far, step, axis) - far > jump
-            other = np.abs(np.roll(tint, step, axis) - tint).sum(axis=-1) > 0.02
-            other &= np.roll(hit, step, axis) & (np.roll(group, step, axis) > 0)
-            dark = np.maximum(dark, np.where(deeper, 1.0, np.where(other, 0.35, 0.0)))
-    return dark * outlined
+        first = tuple(slice(0, -1) if a == axis else slice(None) for a in (0, 1))
+        second = tuple(slice(1, None) if a == axis else slice(None) for a in (0, 1))
+        rise = far[second] - far[first]
+        border = (label[first] != label[second]) & (label[first] > 0) & (label[second] > 0)
+        for here, deeper in ((first, rise > jump), (second, rise < -jump)):
+            view = dark[here]
+            view[border] = np.maximum(view[border], np.float32(0.35))
+            view[deeper] = 1
+    return dark * (label > 0)
 
 
 def _peel(

@@ -63,7 +63,7 @@ class PinholeView:
         R, t = self.cam_from_world[:, :3], self.cam_from_world[:, 3]
         homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
         directions = homogeneous @ (R.T @ np.linalg.inv(self.K)).T
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        directions /= np.sqrt(np.einsum("ij,ij->i", directions, directions))[:, None]
         return -R.T @ t, directions
 
     def moved(self, offset: np.ndarray) -> PinholeView:
