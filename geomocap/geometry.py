@@ -10,6 +10,7 @@ import open3d as o3d
 
 from geomocap.errors import GeometryError
 from geomocap.files import write_atomic
+from geomocap.palette import body_colors
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,49 @@ class Voxels:
         if not grid.has_voxels():
             raise GeometryError(f"{path}: no readable voxel grid; delete it and run again")
         return cls.from_open3d(grid)
+
+
+@dataclass(frozen=True)
+class BodyPoints:
+    """Points of one frame and the rigid bodies that they belong to.
+
+    Attributes
+    ----------
+    positions : (N, 3) float, metres, world
+    body : (N,) int
+        Body of each point, -1: none.
+    """
+
+    positions: np.ndarray
+    body: np.ndarray
+
+    def to_open3d(self) -> o3d.t.geometry.PointCloud:
+        """Return the tensor point cloud with attributes `body` (int32) and `colors` (one a body)."""
+        cloud = o3d.t.geometry.PointCloud(np.ascontiguousarray(self.positions, np.float32))
+        cloud.point["body"] = np.ascontiguousarray(self.body, np.int32)[:, None]
+        cloud.point["colors"] = body_colors(self.body)
+        return cloud
+
+    def write(self, path: Path) -> None:
+        """Write as PLY, whole or not at all."""
+        cloud = self.to_open3d()
+        write_atomic(path, lambda p: o3d.t.io.write_point_cloud(str(p), cloud))
+
+    @classmethod
+    def read(cls, path: Path) -> BodyPoints:
+        """Read points with their bodies.
+
+        Raises
+        ------
+        GeometryError
+            If the file is missing or has no attribute `body`.
+        """
+        if not path.is_file():
+            raise GeometryError(f"{path}: no such point cloud")
+        cloud = o3d.t.io.read_point_cloud(str(path))
+        if "body" not in cloud.point:
+            raise GeometryError(f"{path}: has no attribute `body`; delete it and run again")
+        return cls(cloud.point.positions.numpy().astype(np.float64), cloud.point["body"].numpy().ravel())
 
 
 _HEADER = b"""ply

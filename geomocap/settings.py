@@ -1,6 +1,14 @@
 """Base of all settings: frozen pydantic models in which an unknown key is an error."""
 
-from pydantic import BaseModel, ConfigDict
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from geomocap.errors import SettingsError
+
+Model = TypeVar("Model", bound="Settings")
 
 
 class Settings(BaseModel):
@@ -10,3 +18,30 @@ class Settings(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def check_settings(model: type[Model], values: dict[str, Any], where: str = "") -> Model:
+    """Make settings from plain values.
+
+    Parameters
+    ----------
+    model : type of Settings
+    values : dict
+        Nested as the model is.
+    where : str
+        File that the values come from, for the message.
+
+    Raises
+    ------
+    SettingsError
+        Naming the first key that is unknown, of the wrong type or out of range.
+    """
+    try:
+        return model(**values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(p) for p in first["loc"]) or "(all)"
+        start = f"{where}: " if where else ""
+        if first["type"] == "extra_forbidden":
+            raise SettingsError(f"{start}unknown setting {key}; --help of the command lists them all") from None
+        raise SettingsError(f"{start}setting {key} = {first['input']!r}: {first['msg']}") from None

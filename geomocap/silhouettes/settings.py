@@ -10,6 +10,9 @@ from geomocap.settings import Settings
 class SilhouetteSettings(Settings):
     """How silhouettes are cut out. Evidence is in units of the log likelihood ratio subject : background."""
 
+    samples: int = Field(
+        30, ge=2, description="Frames, spread over the recording, from which a camera's background is learnt."
+    )
     gain: bool = Field(
         default=True, description="Follow slow light changes by a gain and an offset per frame and channel."
     )
@@ -21,6 +24,7 @@ class SilhouetteSettings(Settings):
     shadows: bool = Field(
         default=True, description="Take darker background with the same colour and texture for shadow."
     )
+    colors: bool = Field(default=True, description="Judge doubtful pixels by the colours that the subject has elsewhere.")
     shadow_darkest: float = Field(
         default=0.4, gt=0, lt=1, description="Brightness left in the deepest shadow (ratio to the background)."
     )

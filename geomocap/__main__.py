@@ -1,0 +1,5 @@
+"""`python -m geomocap` is the command `geomocap`."""
+
+from geomocap.cli import main
+
+main()

@@ -1,0 +1,54 @@
+"""From the arguments of a command to a job with its executor and progress bars."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from geomocap.capture import Capture
+from geomocap.cli.execution import executor_for
+from geomocap.cli.progress import progress_bars
+from geomocap.config import Config
+from geomocap.errors import RunError
+from geomocap.pipeline.job import Job
+from geomocap.run import Run
+from geomocap.scans import open_scans
+
+CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder, with capture.toml.")]
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder; made if it isn't there.")]
+
+
+@contextmanager
+def capture_job(
+    capture: Path, run: Path, config: Config, workers: int | None, scheduler: str | None
+) -> Iterator[Job]:
+    """Make the job of a capture."""
+    opened = Capture.open(capture)
+    _check_apart(capture, run)
+    with executor_for(workers, scheduler) as executor, progress_bars() as progress:
+        job = Job(Run(run), config, executor, progress, capture=opened, fps=opened.fps)
+        job.write_record()
+        yield job
+
+
+@contextmanager
+def scans_job(
+    scans: Path, run: Path, fps: float, config: Config, workers: int | None, scheduler: str | None
+) -> Iterator[Job]:
+    """Make the job of a sequence of scans."""
+    opened = open_scans(scans, config.scans)
+    _check_apart(scans, run)
+    with executor_for(workers, scheduler) as executor, progress_bars() as progress:
+        job = Job(Run(run), config, executor, progress, scans=opened, fps=fps)
+        job.write_record()
+        yield job
+
+
+def _check_apart(source: Path, run: Path) -> None:
+    """A run must not write into what it reads."""
+    if run.resolve() == source.resolve() or run.resolve() in source.resolve().parents:
+        raise RunError(f"{run}: holds the input {source}; choose another folder for the run")

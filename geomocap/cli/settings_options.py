@@ -1,0 +1,125 @@
+"""Command-line options made from the settings models: each key of the TOML file is a flag `--section.key`."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import json
+import tomllib
+import types
+import typing
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from geomocap.config import Config, load_config
+from geomocap.settings import Settings, check_settings
+
+_PREFIX, _SEPARATOR = "set__", "__"
+Command = Callable[..., None]
+
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="FILE.toml", help="Settings file; a run's own run.toml repeats that run."),
+]
+
+
+def with_settings(*sections: str) -> Callable[[Command], Command]:
+    """Give a command `--config FILE.toml` and a flag `--section.key` for each setting of the sections.
+
+    The command gets the merged settings as its keyword argument `config`.
+    """
+    fields = [(path, field) for path, field in _leaves(Config, ()) if path[0] in sections]
+    return _with_options("config", fields, load_config, with_file=True)
+
+
+def with_options_of(model: type[Settings]) -> Callable[[Command], Command]:
+    """Give a command a flag `--key` for each setting of a model; it gets them as its keyword argument `settings`."""
+    return _with_options(
+        "settings", list(_leaves(model, ())), lambda _, values: check_settings(model, values), with_file=False
+    )
+
+
+def _with_options(
+    name: str,
+    fields: Sequence[tuple[tuple[str, ...], FieldInfo]],
+    build: Callable[[Path | None, dict[str, Any]], Settings],
+    with_file: bool,
+) -> Callable[[Command], Command]:
+    def decorate(command: Command) -> Command:
+        signature = inspect.signature(command, eval_str=True)
+        parameters = [p for p in signature.parameters.values() if p.name != name]
+        if with_file:
+            parameters.append(_parameter("config_file", ConfigFile))
+        parameters += [_parameter(_PREFIX + _SEPARATOR.join(path), _option(path, field)) for path, field in fields]
+
+        @functools.wraps(command)
+        def wrapper(**arguments: Any) -> None:
+            values: dict[str, Any] = {}
+            for argument in [n for n in arguments if n.startswith(_PREFIX)]:
+                text = arguments.pop(argument)
+                if text is not None:
+                    *tables, key = argument.removeprefix(_PREFIX).split(_SEPARATOR)
+                    table = values
+                    for part in tables:
+                        table = table.setdefault(part, {})
+                    table[key] = _parse(text)
+            arguments[name] = build(arguments.pop("config_file", None), values)
+            command(**arguments)
+
+        wrapper.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+        wrapper.__annotations__ = {p.name: p.annotation for p in parameters}
+        return wrapper
+
+    return decorate
+
+
+def _parameter(name: str, annotation: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+
+
+def _leaves(model: type[BaseModel], path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], FieldInfo]]:
+    """List the single settings below a model with their paths."""
+    for key, field in model.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from _leaves(field.annotation, (*path, key))
+        else:
+            yield (*path, key), field
+
+
+def _option(path: tuple[str, ...], field: FieldInfo) -> Any:
+    default = field.get_default(call_default_factory=True)
+    return Annotated[
+        str | None,
+        typer.Option(
+            f"--{'.'.join(path)}",
+            metavar=_type_name(field.annotation),
+            help=field.description or path[-1].replace("_", " "),
+            show_default="none" if default is None else json.dumps(default).strip('"'),
+            rich_help_panel=f"Settings: {path[0]}" if len(path) > 1 else "Settings",
+        ),
+    ]
+
+
+def _type_name(annotation: Any) -> str:
+    """Name a type as help texts show it."""
+    origin = typing.get_origin(annotation)
+    if origin is typing.Literal:
+        return "|".join(str(a) for a in typing.get_args(annotation))
+    if origin in (types.UnionType, typing.Union):
+        return "|".join(_type_name(a) for a in typing.get_args(annotation) if a is not type(None))
+    if origin is tuple:
+        return "[" + ", ".join(_type_name(a) for a in typing.get_args(annotation) if a is not ...) + "]"
+    return {int: "INT", float: "NUMBER", bool: "true|false", str: "TEXT", Path: "PATH"}.get(annotation, "VALUE")
+
+
+def _parse(text: str) -> Any:
+    """Read a value as TOML does; what isn't TOML is a string."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

@@ -1,0 +1,66 @@
+"""All settings in one TOML file: a table for each stage, every key with a default that works."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from geomocap.carving.settings import CarvingSettings
+from geomocap.errors import SettingsError
+from geomocap.export.settings import ExportSettings
+from geomocap.scans import ScanSettings
+from geomocap.segmentation.settings import SegmentationSettings
+from geomocap.settings import Settings, check_settings
+from geomocap.silhouettes import SilhouetteSettings
+from geomocap.skeleton.settings import SkeletonSettings
+
+
+class Config(Settings):
+    """Settings of all stages."""
+
+    silhouettes: SilhouetteSettings = Field(SilhouetteSettings(), description="silhouettes")
+    carving: CarvingSettings = Field(CarvingSettings(), description="space carving")
+    scans: ScanSettings = Field(ScanSettings(), description="reading of scans")
+    segmentation: SegmentationSettings = Field(SegmentationSettings(), description="bodies")
+    skeleton: SkeletonSettings = Field(SkeletonSettings(), description="joints and hierarchy")
+    export: ExportSettings = Field(ExportSettings(), description="motion files")
+
+
+def load_config(path: Path | None = None, overrides: dict[str, Any] | None = None) -> Config:
+    """Read the settings from a TOML file, override single keys, and check them all.
+
+    Parameters
+    ----------
+    path : Path, optional
+        A settings file, or the `run.toml` of a run that is to be repeated.
+    overrides : dict, optional
+        Nested as the file is: `{section: {key: value}}`.
+
+    Raises
+    ------
+    SettingsError
+        If the file can't be read, a key is unknown or a value out of range.
+    """
+    values: dict[str, Any] = {}
+    if path is not None:
+        try:
+            values = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise SettingsError(f"{path}: can't be read ({error.strerror})") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise SettingsError(f"{path}: not valid TOML ({error})") from None
+        if "config" in values and "geomocap" in values:  # a run.toml
+            values = values["config"]
+    return check_settings(Config, _merge(values, overrides or {}), str(path) if path is not None else "")
+
+
+def _merge(values: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
+    """Return nested tables with those of `overrides` put over them."""
+    merged = dict(values)
+    for key, value in overrides.items():
+        below = merged.get(key)
+        merged[key] = _merge(below, value) if isinstance(value, dict) and isinstance(below, dict) else value
+    return merged

@@ -1,0 +1,22 @@
+"""Stage: skeleton → motion files that need no package beyond the core."""
+
+from __future__ import annotations
+
+from geomocap.export.run_export import FILES, export_run
+from geomocap.pipeline.job import Job
+from geomocap.pipeline.segmentation import Source, segment
+from geomocap.run import stage_key
+
+
+def motion_files(job: Job, source: Source) -> str:
+    """Take a capture or scans all the way to the motion files, and return the stage's key."""
+    segmented = segment(job, source)
+    if not (job.run.path / "skeleton.npz").exists():
+        return segmented
+    key = stage_key("export", segmented, job.config.export.model_dump(), job.up)
+
+    def work() -> int:
+        written = export_run(job.run, settings=job.config.export, progress=job.progress)
+        return len(written.files)
+
+    return job.stage("export", key, [FILES["bvh"], FILES["trc"], FILES["glb"]], work)

@@ -1,0 +1,109 @@
+"""Stage: images → silhouettes, `silhouettes/<camera>/000000.png`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from geomocap.capture import Capture
+from geomocap.errors import CaptureError
+from geomocap.files import write_atomic
+from geomocap.pipeline.job import Job
+from geomocap.run import Run, stage_key
+from geomocap.scheduling import map_items
+from geomocap.silhouettes import (
+    BackgroundModel,
+    SilhouetteSettings,
+    model_from_frames,
+    model_from_plate,
+    region_of_points,
+    silhouette,
+)
+
+
+def silhouettes(job: Job) -> str:
+    """Make the silhouettes of all cameras and frames, and return the stage's key."""
+    capture = job.capture
+    if capture is None:
+        raise CaptureError("silhouettes need a capture")
+    key = stage_key(
+        "silhouettes",
+        str(capture.path.resolve()),
+        capture.fingerprint("images", "videos", "background", "masks", "sparse"),
+        job.config.silhouettes.model_dump(),
+    )
+    return job.stage("silhouettes", key, ["silhouettes"], lambda: _make_silhouettes(job, capture))
+
+
+def _make_silhouettes(job: Job, capture: Capture) -> int:
+    # Camera by camera, so that videos are decoded forwards
+    missing = [
+        (camera, k)
+        for camera in capture.cameras
+        for k in range(capture.n_frames)
+        if not job.run.silhouette_file(camera, k).exists()
+    ]
+    cameras = sorted({camera for camera, _ in missing}, key=capture.cameras.index)
+    if capture.has_masks:
+        task = _Cut(capture, job.run, job.config.silhouettes, {}, {})
+    else:
+        learn = _Learn(capture, job.config.silhouettes)
+        models = dict(zip(cameras, map_items(learn, cameras, job.executor, "background", job.progress, 2), strict=True))
+        task = _Cut(capture, job.run, job.config.silhouettes, models, _regions(capture))
+    for _ in map_items(task, missing, job.executor, "silhouettes", job.progress):
+        pass
+    return len(missing)
+
+
+@dataclass(frozen=True)
+class _Learn:
+    """Background model of one camera."""
+
+    capture: Capture
+    settings: SilhouetteSettings
+
+    def __call__(self, camera: str) -> BackgroundModel:
+        count = min(self.settings.samples, self.capture.n_frames)
+        chosen = np.unique(np.linspace(0, self.capture.n_frames - 1, count).round().astype(int))
+        frames = [self.capture.frame(camera, int(k)) for k in chosen]
+        if self.capture.has_background(camera):
+            return model_from_plate(self.capture.background(camera), frames, self.settings, camera)
+        return model_from_frames(frames, self.settings, camera)
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """Silhouette of one image, written to the run."""
+
+    capture: Capture
+    run: Run
+    settings: SilhouetteSettings
+    models: dict[str, BackgroundModel]
+    regions: dict[str, np.ndarray]
+
+    def __call__(self, item: tuple[str, int]) -> None:
+        camera, frame = item
+        if self.capture.has_masks:
+            mask = self.capture.mask(camera, frame)
+        else:
+            image = self.capture.frame(camera, frame)
+            mask = silhouette(image, self.models[camera], self.settings, self.regions.get(camera))
+        parameters = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+        write_atomic(self.run.silhouette_file(camera, frame), lambda p: cv2.imwrite(str(p), mask, parameters))
+
+
+def _regions(capture: Capture) -> dict[str, np.ndarray]:
+    """Images of the capture's region of interest, (H, W) bool by camera; nothing where there is none."""
+    box = capture.info.region_of_interest
+    if box is None or not capture.is_calibrated:
+        return {}
+    corners = np.stack(np.meshgrid(*np.transpose(box), indexing="ij"), axis=-1).reshape(-1, 3)
+    pixels = capture.rig.project(corners)
+    sizes = capture.rig.sizes
+    return {
+        name: region_of_points(pixels[c], (int(sizes[c, 0]), int(sizes[c, 1])))
+        for c, name in enumerate(capture.cameras)
+        if np.isfinite(pixels[c]).all()
+    }
