@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-LIMIT = 10.0  # no single pixel counts for more than exp(10) : 1
+LIMIT = 10.0  # no single pixel counts for more than exp(10) : 1 for the subject,
+LIMIT_BACK = 4.0  # nor for more than exp(4) : 1 for the background: subjects have its colours here and there
 TEXTURE_WEIGHT = 8.0  # independent samples that the texture of a window counts for: its neighbours vote as well
-NO_QUESTION = -4.0  # pixels with less evidence for the subject are background without more ado
+NO_QUESTION = -3.0  # pixels with less evidence for the subject are background without more ado
 HOPELESS = 60.0  # chi-square of a pixel's colour beyond which no shadow explains it
 SHADOW_PRIOR = 6.0  # log of how much likelier a matching shadow is than a subject of just that colour
+DOUBTFUL = -LIMIT_BACK  # below, no shadow and hardly any noise is left to explain: background
 
 
 @njit(cache=True, nogil=True)
@@ -17,7 +19,7 @@ def background_evidence(image, mean, sigma, known, gain, offset, threshold, unkn
     """Compare each pixel with the lit background.
 
     Half the chi-square of the three channels, minus the prior at which it counts as subject (a subject's colours being
-    spread evenly), limited to ±`LIMIT`.
+    spread evenly), limited to -`LIMIT_BACK` … `LIMIT`.
 
     Parameters
     ----------
@@ -38,7 +40,7 @@ def background_evidence(image, mean, sigma, known, gain, offset, threshold, unkn
     h, w = known.shape
     evidence = np.empty((h, w), np.float32)
     prior = np.float32(0.5 * threshold * threshold)
-    limit = np.float32(LIMIT)
+    limit, least = np.float32(LIMIT), np.float32(-LIMIT_BACK)
     half = np.float32(0.5)
     for y in range(h):
         for x in range(w):
@@ -50,7 +52,7 @@ def background_evidence(image, mean, sigma, known, gain, offset, threshold, unkn
             c = np.float32(image[y, x, 2]) - gain[2] * mean[y, x, 2] - offset[2]
             s = sigma[y, x]
             value = half * (a * a + b * b + c * c) / (s * s) - prior
-            evidence[y, x] = min(max(value, -limit), limit)
+            evidence[y, x] = min(max(value, least), limit)
     return evidence
 
 
@@ -110,7 +112,7 @@ def shadow_evidence(evidence, image, mean, sigma, known, gain, offset, radius, d
                         left = np.float32(image[y, x, c]) - shaded
                         own += left * left / (noise + color * color * shaded * shaded)
                     least = min(least, own)
-            value = np.float32(0.5 * least - SHADOW_PRIOR)
+            value = max(np.float32(0.5 * least - SHADOW_PRIOR), np.float32(-LIMIT_BACK))
             if value < evidence[y, x]:
                 result[y, x] = value
     return result

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numba import njit
 
 from geomocap.errors import CaptureError
 from geomocap.silhouettes.background import BackgroundModel
-from geomocap.silhouettes.evidence import background_evidence, shadow_evidence, smooth_evidence
+from geomocap.silhouettes.colors import color_evidence
+from geomocap.silhouettes.evidence import DOUBTFUL, LIMIT, background_evidence, shadow_evidence, smooth_evidence
 from geomocap.silhouettes.light import light_change
 from geomocap.silhouettes.outline import refine_outline
 from geomocap.silhouettes.settings import SilhouetteSettings
@@ -56,7 +58,7 @@ def silhouette(
     # Evidence of each pixel against background and shadow, then of its surroundings
     evidence = pixel_evidence(image, model, settings, light)
     if region is not None:
-        evidence[~region] = -10.0
+        evidence[~region] = -LIMIT
     voted = evidence
     if settings.smoothing > 0:
         voted = smooth_evidence(evidence, image, model.sigma, np.float32(settings.smoothing), np.float32(settings.edge))
@@ -64,7 +66,7 @@ def silhouette(
     # Subject or not, its outline to half a pixel, pieces and holes that aren't real
     mask = voted > 0
     mask = clean(mask, evidence, settings)
-    mask = refine_outline(mask, image, model.mean, model.known, model.sigma, *light)
+    mask = refine_outline(mask, image, model.mean, model.known, model.sigma, *light, settings.outline_contrast)
     if region is not None:
         mask &= region
     return mask.astype(np.uint8) * np.uint8(255)
@@ -86,24 +88,29 @@ def pixel_evidence(
         np.float32(settings.threshold),
         np.float32(settings.unknown),
     )
-    if not settings.shadows:
-        return evidence
-    return shadow_evidence(
-        evidence,
-        image,
-        model.mean,
-        model.sigma,
-        model.known,
-        *light,
-        settings.shadow_radius,
-        settings.shadow_darkest,
-        settings.shadow_lightest,
-        settings.shadow_color,
-    )
+    if settings.shadows:
+        evidence = shadow_evidence(
+            evidence,
+            image,
+            model.mean,
+            model.sigma,
+            model.known,
+            *light,
+            settings.shadow_radius,
+            settings.shadow_darkest,
+            settings.shadow_lightest,
+            settings.shadow_color,
+        )
+    if settings.colors:
+        color_evidence(evidence, image, np.float32(DOUBTFUL), np.float32(LIMIT))
+    return evidence
 
 
 def clean(mask: np.ndarray, evidence: np.ndarray, settings: SilhouetteSettings) -> np.ndarray:
-    """Drop small pieces, and fill enclosed holes whose evidence for the background is weak.
+    """Fill enclosed holes and drop separate pieces whose evidence is weak for the length of their border.
+
+    The rule of a Potts model for whole regions: a region's own evidence must pay for its border. Size thresholds for
+    pieces come on top.
 
     Parameters
     ----------
@@ -116,25 +123,56 @@ def clean(mask: np.ndarray, evidence: np.ndarray, settings: SilhouetteSettings) 
     -------
     (H, W) bool
     """
+    # Holes: regions of background that don't reach the border of the image
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
+    total, border = region_sums(labels, evidence, count)
+    h, w = mask.shape
+    x, y, width, height, areas = stats.T
+    enclosed = (x > 0) & (y > 0) & (x + width < w) & (y + height < h)
+    weak = enclosed & (-total < settings.coherence * border)
+    weak[0] = True
+    mask = weak[labels]
+
+    # Pieces
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     if count == 1:
         return mask
-    areas = stats[:, cv2.CC_STAT_AREA].copy()
-    areas[0] = 0
-    least = max(settings.smallest * mask.size, settings.smallest_relative * areas.max())
-    mask = (areas >= least)[labels]
+    total, border = region_sums(labels, evidence, count)
+    areas = stats[:, cv2.CC_STAT_AREA]
+    least = max(settings.smallest * mask.size, settings.smallest_relative * float(areas[1:].max()))
+    keep = (areas >= least) & (total > settings.coherence * border)
+    keep[0] = False
+    return keep[labels]
 
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
-    h, w = mask.shape
-    x, y, width, height = (stats[:, k] for k in range(4))
-    fill = (x > 0) & (y > 0) & (x + width < w) & (y + height < h)
-    fill[0] = False
-    for k in np.flatnonzero(fill):
-        part = (slice(y[k], y[k] + height[k]), slice(x[k], x[k] + width[k]))
-        inside = labels[part] == k
-        if evidence[part][inside].mean() > settings.hole_evidence:
-            mask[part] |= inside
-    return mask
+
+@njit(cache=True, nogil=True)
+def region_sums(labels, evidence, count):
+    """Sum the evidence of labelled regions and count the pairs of neighbouring pixels across their borders.
+
+    Parameters
+    ----------
+    labels : (H, W) int32
+    evidence : (H, W) float32
+    count : int
+        Number of labels.
+
+    Returns
+    -------
+    total, border : (count,) float64
+    """
+    h, w = labels.shape
+    total, border = np.zeros(count), np.zeros(count)
+    for y in range(h):
+        for x in range(w):
+            k = labels[y, x]
+            total[k] += evidence[y, x]
+            if x + 1 < w and labels[y, x + 1] != k:
+                border[k] += 1
+                border[labels[y, x + 1]] += 1
+            if y + 1 < h and labels[y + 1, x] != k:
+                border[k] += 1
+                border[labels[y + 1, x]] += 1
+    return total, border
 
 
 def coverage(mask: np.ndarray, region: np.ndarray | None = None) -> float:

@@ -9,12 +9,13 @@ REACH = 3  # pixels from which the colours on either side are taken
 
 
 @njit(cache=True, nogil=True)
-def refine_outline(mask, image, mean, known, sigma, gain, offset):
+def refine_outline(mask, image, mean, known, sigma, gain, offset, contrast):
     """Decide the pixels on both sides of the outline by the subject's share of their colour.
 
     A pixel on the outline mixes the subject's colour F and the background's B, I = a F + (1 - a) B. B is known (shaded
     as the background pixels beside it), F is the mean of the subject's pixels nearby that aren't on the outline
-    themselves. The pixel belongs to the subject if a >= 1/2. Where F and B are too alike the pixel stays as it is.
+    themselves. The pixel belongs to the subject if a >= 1/2. Where F varies too much to tell it from B, the pixel stays
+    as it is.
 
     Parameters
     ----------
@@ -22,6 +23,8 @@ def refine_outline(mask, image, mean, known, sigma, gain, offset):
     image : (H, W, 3) uint8
     mean, known, sigma, gain, offset
         As in `background_evidence`.
+    contrast : float
+        Least difference of F and B, in standard deviations of F nearby.
 
     Returns
     -------
@@ -45,7 +48,7 @@ def refine_outline(mask, image, mean, known, sigma, gain, offset):
             if not rim[y, x] or not known[y, x]:
                 continue
             front[:] = 0.0
-            inside, outside = 0.0, 0.0
+            inside, outside, square = 0.0, 0.0, 0.0
             seen, plain = 0.0, 0.0
             for v in range(max(0, y - REACH), min(h, y + REACH + 1)):
                 for u in range(max(0, x - REACH), min(w, x + REACH + 1)):
@@ -56,6 +59,7 @@ def refine_outline(mask, image, mean, known, sigma, gain, offset):
                         inside += weight
                         for c in range(3):
                             front[c] += weight * image[v, u, c]
+                            square += weight * np.float64(image[v, u, c]) ** 2
                     elif known[v, u]:
                         outside += weight
                         for c in range(3):
@@ -64,12 +68,13 @@ def refine_outline(mask, image, mean, known, sigma, gain, offset):
             if inside == 0.0:
                 continue
             shade = min(max(seen / plain, 0.2), 1.5) if outside > 0.0 and plain > 0.0 else 1.0
-            step, share = 0.0, 0.0
+            step, share, spread = 0.0, 0.0, square / inside
             for c in range(3):
                 back[c] = shade * (gain[c] * mean[y, x, c] + offset[c])
                 front[c] /= inside
+                spread -= front[c] * front[c]
                 step += (front[c] - back[c]) ** 2
                 share += (image[y, x, c] - back[c]) * (front[c] - back[c])
-            if step > (6.0 * sigma[y, x]) ** 2:
+            if step > max((6.0 * sigma[y, x]) ** 2, contrast * contrast * spread):
                 result[y, x] = share >= 0.5 * step
     return result

@@ -17,14 +17,16 @@ class SilhouetteSettings(Settings):
         default=True, description="Follow slow light changes by a gain and an offset per frame and channel."
     )
     threshold: float = Field(
-        default=5.0,
+        default=4.0,
         gt=0,
         description="Difference from the background at which a pixel is as likely subject (noise sigmas).",
     )
     shadows: bool = Field(
         default=True, description="Take darker background with the same colour and texture for shadow."
     )
-    colors: bool = Field(default=True, description="Judge doubtful pixels by the colours that the subject has elsewhere.")
+    colors: bool = Field(
+        default=True, description="Judge doubtful pixels by the colours that the subject has elsewhere."
+    )
     shadow_darkest: float = Field(
         default=0.4, gt=0, lt=1, description="Brightness left in the deepest shadow (ratio to the background)."
     )
@@ -43,17 +45,22 @@ class SilhouetteSettings(Settings):
     smoothing: float = Field(
         default=3.0, ge=0, description="Reach of the edge-preserving smoothing of the evidence (pixels); 0: none."
     )
-    edge: float = Field(default=6.0, gt=0, description="Colour step that stops the smoothing (noise sigmas).")
+    edge: float = Field(default=12.0, gt=0, description="Colour step that stops the smoothing (noise sigmas).")
     unknown: float = Field(
         default=1.0,
         ge=-10,
         le=10,
         description="Evidence for the subject where the background was never seen (log ratio).",
     )
-    hole_evidence: float = Field(
-        default=-3.0,
-        le=0,
-        description="Enclosed holes with a mean evidence above this are filled (log ratio, per pixel).",
+    coherence: float = Field(
+        default=3.0,
+        ge=0,
+        description="Holes and separate pieces with less evidence than this on each pixel of their border are undone.",
+    )
+    outline_contrast: float = Field(
+        default=1.0,
+        ge=0,
+        description="Contrast to the background that sharpens outlines (standard deviations of the subject's colours).",
     )
     smallest: float = Field(
         default=0.0005, ge=0, lt=1, description="Smaller separate pieces are dropped (fraction of the image)."
