@@ -1,0 +1,102 @@
+"""Epipolar geometry of pinhole images, as the matching kernels use it.
+
+A template pixel x̃ = (x, y, 1) at inverse depth μ = 1/Z along the template camera's axis is seen in search camera i at
+
+    π_i(μ) ∝ K_i R_i R_tᵀ K_t⁻¹ x̃ + μ K_i (t_i − R_i R_tᵀ t_t),
+
+a straight line that μ runs through. The first nine numbers of a transfer are the matrix, row by row, the last three the
+vector; both are written for array indices (COLMAP pixel minus 0.5), which is what the kernels work in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from geomocap.cameras import Rig
+from geomocap.errors import CalibrationError
+
+_INDEX_FROM_PIXEL = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])
+_PIXEL_FROM_INDEX = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
+
+
+def transfers(rig: Rig, template: int, searches: Sequence[int]) -> np.ndarray:
+    """Return the epipolar geometry of a template camera and its search cameras.
+
+    Parameters
+    ----------
+    rig : Rig
+        Pinhole cameras (`Rig.undistorted`).
+    template : int
+    searches : sequence of K int
+
+    Returns
+    -------
+    transfers : (K, 12) float
+        Matrix and vector as in the module's text, for array indices.
+
+    Raises
+    ------
+    CalibrationError
+        If a camera has lens distortion.
+    """
+    if not rig.is_pinhole:
+        raise CalibrationError("epipolar lines are straight only without lens distortion: use Rig.undistorted()")
+    K = np.array([c.calibration_matrix() for c in rig.cameras])
+    R, t = rig.cam_from_world[:, :, :3], rig.cam_from_world[:, :, 3]
+    result = np.empty((len(searches), 12))
+    for k, i in enumerate(searches):
+        relative = R[i] @ R[template].T
+        A = _INDEX_FROM_PIXEL @ K[i] @ relative @ np.linalg.inv(K[template]) @ _PIXEL_FROM_INDEX
+        b = _INDEX_FROM_PIXEL @ K[i] @ (t[i] - relative @ t[template])
+        result[k] = [*A.ravel(), *b]
+    return result
+
+
+def seen_at(transfers: np.ndarray, pixels: np.ndarray, inverse_depth: np.ndarray) -> np.ndarray:
+    """Where template pixels are seen in the search images.
+
+    Parameters
+    ----------
+    transfers : (K, 12) float
+    pixels : (N, 2) float
+        COLMAP pixels of the template image.
+    inverse_depth : (N,) float, 1/m
+
+    Returns
+    -------
+    (N, K, 2) float, COLMAP pixels; NaN behind a camera.
+    """
+    x = np.column_stack([np.asarray(pixels, dtype=np.float64) - 0.5, np.ones(len(pixels))])
+    A, b = transfers[:, :9].reshape(-1, 3, 3), transfers[:, 9:]
+    p = np.einsum("kij,nj->nki", A, x) + np.asarray(inverse_depth)[:, None, None] * b
+    with np.errstate(divide="ignore", invalid="ignore"):
+        seen = p[..., :2] / p[..., 2:]
+    seen[p[..., 2] <= 1e-9] = np.nan
+    return seen + 0.5
+
+
+def plane_affine(transfers: np.ndarray, pixels: np.ndarray, inverse_depth: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Affine matrices of small patches on planes.
+
+    On a plane the inverse depth is linear in the image: μ(x + dx) = μ + slope · dx, so that the patch's warp is the
+    derivative of π(x, μ(x)).
+
+    Parameters
+    ----------
+    transfers : (K, 12) float
+    pixels : (N, 2) float, COLMAP pixels of the template image
+    inverse_depth : (N,) float, 1/m
+    slope : (N, 2) float, 1/m per pixel
+
+    Returns
+    -------
+    (N, K, 2, 2) float
+    """
+    x = np.column_stack([np.asarray(pixels, dtype=np.float64) - 0.5, np.ones(len(pixels))])
+    A, b = transfers[:, :9].reshape(-1, 3, 3), transfers[:, 9:]
+    p = np.einsum("kij,nj->nki", A, x) + np.asarray(inverse_depth)[:, None, None] * b
+    gradient = A[None, :, :, :2] + b[None, :, :, None] * np.asarray(slope)[:, None, None, :]
+    seen = p[..., :2, None] / p[..., 2:, None]
+    return (gradient[..., :2, :] - seen * gradient[..., 2:, :]) / p[..., 2:, None]
