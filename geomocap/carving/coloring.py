@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from geomocap.carving.grid import Grid
 from geomocap.carving.occupancy import Occupancy
 from geomocap.carving.views import PinholeViews
-from geomocap.carving.visibility import normals, sightings
+from geomocap.carving.visibility import depth_buffers, normals, sightings
 
 GREY = 160
 
@@ -22,14 +22,14 @@ def voxel_colors(
     A camera weighs with the squared cosine between its ray and the surface's normal. Voxels that no camera sees take
     the colour of the nearest one that is seen; if none is seen at all they are grey.
     """
-    seen = sightings(views, images, grid, surface)
+    seen = sightings(views, images, grid, surface, depth_buffers(views, grid, surface))
     centers = -np.linalg.solve(views.projections[:, :, :3], views.projections[:, :, 3:])[:, :, 0]
     colors = np.full((len(surface), 3), GREY, np.uint8)
     has_color = np.zeros(len(surface), np.bool_)
     positions = grid.centers(surface)
     _blend(seen.seen, seen.colors, positions, normals(occupancy, surface), centers, colors, has_color)
     if has_color.any() and not has_color.all():
-        nearest = cKDTree(positions[has_color]).query(positions[~has_color])[1]
+        nearest = cKDTree(positions[has_color], balanced_tree=False, compact_nodes=False).query(positions[~has_color])[1]
         colors[~has_color] = colors[has_color][nearest]
     return colors
 

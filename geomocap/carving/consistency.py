@@ -13,7 +13,7 @@ from geomocap.carving.grid import Grid
 from geomocap.carving.occupancy import Occupancy
 from geomocap.carving.settings import ConsistencySettings
 from geomocap.carving.views import PinholeViews
-from geomocap.carving.visibility import Sightings, sightings
+from geomocap.carving.visibility import Sightings, depth_buffers, sightings
 
 
 def carve_inconsistent(
@@ -40,23 +40,25 @@ def carve_inconsistent(
     Kutulakos, Approximate N-view stereo, ECCV 2000.
     """
     bits = occupancy.bits.copy()
-    gains = None
-    for _ in range(settings.max_passes):
+    judged, bad = np.zeros_like(bits), np.zeros_like(bits)
+    changed = np.ones_like(bits, dtype=np.bool_)
+    gains = np.ones((len(views), 3), np.float32)
+    for step in range(settings.max_passes):
         surface = Occupancy(bits, occupancy.shape).surface_indices()
-        if len(surface) == 0:
-            break
-        seen = sightings(views, images, grid, surface, settings.window)
-        if gains is None:
-            gains = camera_gains(seen) if settings.gain else np.ones((len(views), 3), np.float32)
+        depth = depth_buffers(views, grid, surface)
+        voxels = surface if step == 0 else surface[_near(changed, surface)]
+        seen = sightings(views, images, grid, voxels, depth, settings.window)
+        if step == 0 and settings.gain:
+            gains = camera_gains(seen)
         deviation = color_deviation(seen, gains, settings.min_cameras)
-        judged, bad = np.zeros_like(bits), np.zeros_like(bits)
-        taken = _vote(bits, surface, deviation, settings.threshold, settings.support, judged, bad)
-        if taken == 0:
+        _judge(voxels, deviation, settings.threshold, judged, bad)
+        changed[:] = False
+        if _take(bits, surface, settings.support, judged, bad, changed) == 0:
             break
     return Occupancy(bits, occupancy.shape)
 
 
-def camera_gains(seen: Sightings, samples: int = 4000) -> np.ndarray:
+def camera_gains(seen: Sightings, samples: int = 2000) -> np.ndarray:
     """Estimate one factor a camera and channel that brings its colours to the middle of all, (C, 3) float32.
 
     The median over voxels that three or more cameras see of (median colour of the cameras / this camera's colour).
@@ -118,21 +120,43 @@ def _deviate(seen, colors, low, high, gains, min_cameras, out):
 
 
 @njit(cache=True, nogil=True)
-def _vote(bits, surface, deviation, threshold, support, judged, bad):
-    """Take from `bits` the inconsistent voxels whose surroundings (5³) are inconsistent too; return how many."""
-    X, Y, K = bits.shape
+def _near(changed, surface):
+    """Mark the surface voxels within a word or so of a change; what is farther away is not judged again."""
+    X, Y, K = changed.shape
+    near = np.zeros(len(surface), np.bool_)
     for n in range(len(surface)):
-        i, j, k = surface[n, 0], surface[n, 1], surface[n, 2]
+        i, j, k = surface[n, 0], surface[n, 1], surface[n, 2] >> 5
+        for a in range(max(i - 1, 0), min(i + 2, X)):
+            for b in range(max(j - 1, 0), min(j + 2, Y)):
+                for c in range(max(k - 1, 0), min(k + 2, K)):
+                    near[n] |= changed[a, b, c]
+    return near
+
+
+@njit(cache=True, nogil=True)
+def _judge(voxels, deviation, threshold, judged, bad):
+    """Write into the bits which voxels could be judged and which are inconsistent."""
+    for n in range(len(voxels)):
+        i, j, k = voxels[n, 0], voxels[n, 1], voxels[n, 2]
         bit = np.uint32(1 << (k & 31))
+        judged[i, j, k >> 5] &= ~bit
+        bad[i, j, k >> 5] &= ~bit
         if deviation[n] >= 0:
             judged[i, j, k >> 5] |= bit
             if deviation[n] > threshold:
                 bad[i, j, k >> 5] |= bit
+
+
+@njit(cache=True, nogil=True)
+def _take(bits, surface, support, judged, bad, changed):
+    """Take from `bits` the inconsistent voxels whose surroundings (5³) are inconsistent too; return how many."""
+    X, Y, K = bits.shape
     taken = 0
     for n in range(len(surface)):
-        if deviation[n] <= threshold:
-            continue
         i, j, k = surface[n, 0], surface[n, 1], surface[n, 2]
+        bit = np.uint32(1 << (k & 31))
+        if not bad[i, j, k >> 5] & bit:
+            continue
         n_judged, n_bad = 0, 0
         for a in range(max(i - 2, 0), min(i + 3, X)):
             for b in range(max(j - 2, 0), min(j + 3, Y)):
@@ -142,6 +166,13 @@ def _vote(bits, surface, deviation, threshold, support, judged, bad):
                         n_judged += 1
                         n_bad += (bad[a, b, z >> 5] >> shift) & np.uint32(1)
         if n_bad >= support * n_judged:
-            bits[i, j, k >> 5] &= ~np.uint32(1 << (k & 31))
+            bits[i, j, k >> 5] &= ~bit
+            changed[i, j, k >> 5] = True
             taken += 1
+    for n in range(len(surface)):  # what is gone no longer counts for its neighbours
+        i, j, k = surface[n, 0], surface[n, 1], surface[n, 2]
+        bit = np.uint32(1 << (k & 31))
+        if not bits[i, j, k >> 5] & bit:
+            judged[i, j, k >> 5] &= ~bit
+            bad[i, j, k >> 5] &= ~bit
     return taken

@@ -26,12 +26,12 @@ class HullSettings(Settings):
 class ConsistencySettings(Settings):
     """Colour consistency of the surface voxels."""
 
-    enabled: bool = Field(default=False, description="carve surface voxels whose colours differ between the cameras")
+    enabled: bool = Field(default=True, description="carve surface voxels whose colours differ between the cameras")
     threshold: float = Field(
-        default=25.0, gt=0, description="colour deviation above which a voxel goes (grey values, 0–255)"
+        default=10.0, gt=0, description="colour deviation above which a voxel goes (grey values, 0–255)"
     )
     window: int = Field(
-        default=1, ge=0, le=5, description="how far a projection may be off: radius of the window (pixels)"
+        default=0, ge=0, le=5, description="how far a projection may be off: radius of the window (pixels)"
     )
     min_cameras: int = Field(
         default=3, ge=2, description="cameras that must see a voxel before it can be judged (count)"

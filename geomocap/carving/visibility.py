@@ -45,8 +45,10 @@ def depth_buffers(views: PinholeViews, grid: Grid, surface: np.ndarray) -> np.nd
     return depth
 
 
-def sightings(views: PinholeViews, images: np.ndarray, grid: Grid, surface: np.ndarray, window: int = 0) -> Sightings:
-    """Find which cameras see each surface voxel and with which colour.
+def sightings(
+    views: PinholeViews, images: np.ndarray, grid: Grid, voxels: np.ndarray, depth: np.ndarray, window: int = 0
+) -> Sightings:
+    """Find which cameras see each of some surface voxels and with which colour.
 
     Parameters
     ----------
@@ -54,13 +56,13 @@ def sightings(views: PinholeViews, images: np.ndarray, grid: Grid, surface: np.n
     images : (C, H, W, 3) uint8
         Undistorted images on the canvas of the views.
     grid : Grid
-    surface : (N, 3) int
-        All surface voxels: they hide each other.
+    voxels : (N, 3) int
+    depth : (C, H, W) float32
+        Depth buffers of the whole surface.
     window : int
         Radius of the window of `low` and `high`, pixels; 0: the voxel's own pixels.
     """
-    depth = depth_buffers(views, grid, surface)
-    N, C = len(surface), len(views)
+    N, C = len(voxels), len(views)
     seen = np.zeros((N, C), np.uint8)
     colors = np.zeros((N, C, 3), np.float32)
     low, high = np.zeros((N, C, 3), np.uint8), np.zeros((N, C, 3), np.uint8)
@@ -70,7 +72,7 @@ def sightings(views: PinholeViews, images: np.ndarray, grid: Grid, surface: np.n
         views.valid,
         images,
         depth,
-        np.ascontiguousarray(surface, np.int32),
+        np.ascontiguousarray(voxels, np.int32),
         grid.origin,
         grid.voxel_size,
         DEPTH_SLACK * grid.voxel_size,
@@ -172,22 +174,32 @@ def _look(P, masks, valid, images, depth, surface, origin, edge, slack, window, 
             high[n, c, 0], high[n, c, 1], high[n, c, 2] = r1, g1, b1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, parallel=True)
 def _away(bits, surface):
     X, Y, K = bits.shape
+    # of five bits along z: how many are set, and the sum of their offsets −2 … 2
+    counts, moments = np.zeros(32, np.int64), np.zeros(32, np.int64)
+    for pattern in range(32):
+        for b in range(5):
+            if (pattern >> b) & 1:
+                counts[pattern] += 1
+                moments[pattern] += b - 2
     out = np.zeros((len(surface), 3), np.float32)
-    for n in range(len(surface)):
+    for n in prange(len(surface)):
         i, j, k = surface[n, 0], surface[n, 1], surface[n, 2]
-        for a in range(-2, 3):
-            for b in range(-2, 3):
-                if not (0 <= i + a < X and 0 <= j + b < Y):
-                    continue
-                for c in range(-2, 3):
-                    z = k + c
-                    if z < 0 or z >= 32 * K:
-                        continue
-                    if (bits[i + a, j + b, z >> 5] >> np.uint32(z & 31)) & np.uint32(1):
-                        out[n, 0] -= a
-                        out[n, 1] -= b
-                        out[n, 2] -= c
+        word, shift = k >> 5, k & 31
+        x = y = z = 0
+        for a in range(max(-2, -i), min(3, X - i)):
+            for b in range(max(-2, -j), min(3, Y - j)):
+                # the word with its neighbours' nearest two bits, so that bit k − 2 comes first
+                row = np.int64(bits[i + a, j + b, word]) << 2
+                if word > 0:
+                    row |= np.int64(bits[i + a, j + b, word - 1]) >> 30
+                if word < K - 1:
+                    row |= (np.int64(bits[i + a, j + b, word + 1]) & 3) << 34
+                pattern = (row >> shift) & 31
+                x -= a * counts[pattern]
+                y -= b * counts[pattern]
+                z -= moments[pattern]
+        out[n, 0], out[n, 1], out[n, 2] = x, y, z
     return out
