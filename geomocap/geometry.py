@@ -102,15 +102,16 @@ class BodyPoints:
 
     def to_open3d(self) -> o3d.t.geometry.PointCloud:
         """Return the tensor point cloud with attributes `body` (int32) and `colors` (one a body)."""
-        cloud = o3d.t.geometry.PointCloud(np.ascontiguousarray(self.positions, np.float32))
-        cloud.point["body"] = np.ascontiguousarray(self.body, np.int32)[:, None]
-        cloud.point["colors"] = body_colors(self.body)
+        positions = o3d.core.Tensor(np.ascontiguousarray(self.positions, np.float32))  # type: ignore[call-overload]
+        cloud = o3d.t.geometry.PointCloud(positions)
+        cloud.point["body"] = np.ascontiguousarray(self.body, np.int32)[:, None]  # type: ignore[call-overload]
+        cloud.point["colors"] = body_colors(self.body)  # type: ignore[call-overload]
         return cloud
 
     def write(self, path: Path) -> None:
         """Write as PLY, whole or not at all."""
         cloud = self.to_open3d()
-        write_atomic(path, lambda p: o3d.t.io.write_point_cloud(str(p), cloud))
+        write_atomic(path, lambda p: o3d.t.io.write_point_cloud(p, cloud))
 
     @classmethod
     def read(cls, path: Path) -> BodyPoints:
@@ -123,7 +124,7 @@ class BodyPoints:
         """
         if not path.is_file():
             raise GeometryError(f"{path}: no such point cloud")
-        cloud = o3d.t.io.read_point_cloud(str(path))
+        cloud = o3d.t.io.read_point_cloud(path)
         if "body" not in cloud.point:
             raise GeometryError(f"{path}: has no attribute `body`; delete it and run again")
         return cls(cloud.point.positions.numpy().astype(np.float64), cloud.point["body"].numpy().ravel())

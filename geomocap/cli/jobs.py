@@ -23,9 +23,7 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder; made
 
 
 @contextmanager
-def capture_job(
-    capture: Path, run: Path, config: Config, workers: int | None, scheduler: str | None
-) -> Iterator[Job]:
+def capture_job(capture: Path, run: Path, config: Config, workers: int | None, scheduler: str | None) -> Iterator[Job]:
     """Make the job of a capture."""
     opened = Capture.open(capture)
     _check_apart(capture, run)

@@ -1,0 +1,107 @@
+"""Commands that make captures: synthesize, import, demo."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from data_tools.asset import AnimatedAsset
+from data_tools.figure import figure, mechanism
+from data_tools.gltf import load_gltf
+from data_tools.importing import SizeMismatch, import_colmap, import_pose2sim
+from data_tools.synthesize import SynthesisSettings
+from data_tools.synthesize import synthesize as synthesize_capture
+from geomocap import pipeline
+from geomocap.cli.execution import Workers, executor_for
+from geomocap.cli.jobs import CaptureFolder, capture_job
+from geomocap.cli.progress import progress_bars
+from geomocap.cli.reports import console, review_job, tell_results
+from geomocap.cli.settings_options import with_options_of
+from geomocap.config import Config
+
+BUILT_IN: dict[str, Callable[[], AnimatedAsset]] = {"figure": figure, "mechanism": mechanism}
+DEMO = SynthesisSettings(cameras=6, width=320, height=240, fps=15, frames=30)
+
+
+@with_options_of(SynthesisSettings)
+def synthesize(
+    asset: Annotated[
+        str, typer.Argument(metavar="ASSET", help="Animated .glb/.gltf file, or a built-in subject: figure, mechanism.")
+    ],
+    capture: CaptureFolder,
+    settings: SynthesisSettings,
+    truth: Annotated[
+        Path | None, typer.Option("--truth", metavar="DIR", help="Folder for the truth; CAPTURE_truth if not given.")
+    ] = None,
+    animation: Annotated[
+        str | None, typer.Option("--animation", help="Name or number of the animation; the first if not given.")
+    ] = None,
+    workers: Workers = None,
+) -> None:
+    """Synthesize a multi-camera capture with ground truth from an animated glTF.
+
+    Example: `geomocap synthesize horse.glb horse --animation Walk --cameras 8 --width 320 --height 240 --fps 15`
+    """
+    truth = truth or capture.with_name(capture.name + "_truth")
+    with executor_for(workers, None) as executor, progress_bars() as progress:
+        result = synthesize_capture(
+            open_asset(asset, animation), capture, truth, settings, executor=executor, progress=progress
+        )
+    for note in result.notes:
+        console.print(f"note: {note}")
+    console.print(f"{capture}: {len(result.rig)} cameras, {settings.frames} frames; truth in {truth}")
+
+
+def import_(
+    kind: Annotated[Literal["pose2sim", "colmap"], typer.Argument(metavar="KIND", help="pose2sim or colmap.")],
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="The other tool's folder.")],
+    capture: CaptureFolder,
+    fps: Annotated[float, typer.Option("--fps", min=0.001, help="colmap: frames per second.")] = 30.0,
+    up: Annotated[Literal["x", "y", "z"], typer.Option("--up", help="colmap: world axis that points up.")] = "z",
+    metres_per_unit: Annotated[
+        float, typer.Option("--metres-per-unit", min=1e-9, help="colmap: metres in a unit of the model.")
+    ] = 1.0,
+    size_mismatch: Annotated[
+        SizeMismatch, typer.Option("--size-mismatch", help="pose2sim: how images came to another size than calibrated.")
+    ] = "auto",
+) -> None:
+    """Turn another tool's session into a capture.
+
+    pose2sim: a session folder with calibration/ (Qualisys or Pose2Sim TOML) and videos/.
+    colmap: a folder with sparse/ and images/<camera>/.
+    """
+    with progress_bars() as progress:
+        if kind == "pose2sim":
+            report = import_pose2sim(source, capture, size_mismatch=size_mismatch, progress=progress)
+        else:
+            report = import_colmap(source, capture, fps, metres_per_unit=metres_per_unit, up=up, progress=progress)
+    for note in report.notes:
+        console.print(f"note: {note}")
+    opened = report.capture
+    console.print(f"{capture}: {len(opened.cameras)} cameras, {opened.n_frames} frames at {opened.fps:g} fps")
+
+
+def demo(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for capture, truth and run.")] = Path("demo"),
+    workers: Workers = None,
+) -> None:
+    """Synthesize a small capture of the built-in figure and take it all the way to the report."""
+    capture, truth, run = out / "capture", out / "truth", out / "run"
+    with executor_for(workers, None) as executor, progress_bars() as progress:
+        if not (capture / "capture.toml").exists():
+            synthesize_capture(figure(), capture, truth, DEMO, executor=executor, progress=progress)
+    with capture_job(capture, run, Config(), workers, None) as job:
+        key = pipeline.motion_files(job, "voxels")
+        review_job(job, key)
+    tell_results(run)
+
+
+def open_asset(name: str, animation: str | None) -> AnimatedAsset:
+    """Make a built-in subject, or load an animated glTF file."""
+    if name in BUILT_IN and not Path(name).exists():
+        return BUILT_IN[name]()
+    chosen = int(animation) if animation is not None and animation.isdigit() else animation
+    return load_gltf(Path(name), chosen)

@@ -1,0 +1,48 @@
+"""Where pictures and reports are made from a run, and where a user is told of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+
+from geomocap.capture import Capture
+from geomocap.errors import GeomocapError
+from geomocap.files import fingerprint
+from geomocap.pipeline.job import Job
+from geomocap.run import Run, stage_key
+from viz.review import review
+
+console = Console(highlight=False, soft_wrap=True)
+
+
+def review_job(job: Job, made_from: str) -> None:
+    """Make the report of a job, unless it has been made from the same results.
+
+    Parameters
+    ----------
+    made_from : str
+        Key of the last stage that the report shows.
+    """
+    code = fingerprint([Path(review.__code__.co_filename).parent])
+    key = stage_key("review", made_from, code, sorted(job.run.read_timings()))
+    job.stage("review", key, ["review"], lambda: len(review(job.run, job.capture, progress=job.progress)))
+
+
+def capture_of(run: Run) -> Capture | None:
+    """Open the capture that a run was made from; None if there was none or it has gone."""
+    source = run.read_record().get("source", {})
+    if source.get("kind") != "capture":
+        return None
+    try:
+        return Capture.open(Path(source["path"]))
+    except GeomocapError as error:
+        console.print(f"note: the capture can't be shown ({error})")
+        return None
+
+
+def tell_results(run: Path) -> None:
+    """Print where the results are."""
+    for what, file in (("motion", "motion.bvh"), ("report", "review/report.html")):
+        if (run / file).exists():
+            console.print(f"{what}: {run / file}")
