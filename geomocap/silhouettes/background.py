@@ -132,6 +132,34 @@ def model_from_frames(
         If there are fewer than three frames, or their sizes differ.
     """
     settings = settings or SilhouetteSettings()
+    mean, sigma, support = background_over_time(frames, settings, camera)
+    least = max(settings.support, 2.0 / len(frames))
+    return BackgroundModel(mean, sigma, support >= least, camera)
+
+
+def background_over_time(
+    frames: Sequence[np.ndarray], settings: SilhouetteSettings, camera: str = ""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find at each pixel the colour that the most frames agree on, and how many they are.
+
+    Parameters
+    ----------
+    frames, settings, camera
+        As in `model_from_frames`.
+
+    Returns
+    -------
+    mean : (H, W, 3) float32
+    sigma : (H, W) float32
+        Noise, grey levels.
+    support : (H, W) float32
+        Fraction of the frames.
+
+    Raises
+    ------
+    CaptureError
+        If there are fewer than three frames, or their sizes differ.
+    """
     if len(frames) < 3:
         raise CaptureError(
             f"background{_of(camera)}: {len(frames)} frames; an estimate over time needs at least 3: "
@@ -148,9 +176,7 @@ def model_from_frames(
     offsets = np.array([o for _, o in lights], np.float32)
     mean, support = agreement(stack, gains, offsets, 3.0 * sigma, LIT)
     model = BackgroundModel(mean, sigma, known, camera)
-    sigma = _noise(frames, lights, model)
-    least = max(settings.support, 2.0 / len(frames))
-    return BackgroundModel(mean, sigma, support >= least, camera)
+    return mean, _noise(frames, lights, model), support
 
 
 def _light(image: np.ndarray, model: BackgroundModel, settings: SilhouetteSettings) -> tuple[np.ndarray, np.ndarray]:
