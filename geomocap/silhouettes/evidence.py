@@ -9,7 +9,7 @@ LIMIT = 10.0  # no single pixel counts for more than exp(10) : 1 for the subject
 LIMIT_BACK = 4.0  # nor for more than exp(4) : 1 for the background: subjects have its colours here and there
 TEXTURE_WEIGHT = 8.0  # independent samples that the texture of a window counts for: its neighbours vote as well
 NO_QUESTION = -3.0  # pixels with less evidence for the subject are background without more ado
-HOPELESS = 60.0  # chi-square of a pixel's colour beyond which no shadow explains it
+HOPELESS = 25.0  # chi-square of a pixel's colour beyond which no shadow explains it
 SHADOW_PRIOR = 6.0  # log of how much likelier a matching shadow is than a subject of just that colour
 DOUBTFUL = -LIMIT_BACK  # below, no shadow and hardly any noise is left to explain: background
 
@@ -85,19 +85,35 @@ def shadow_evidence(evidence, image, mean, sigma, known, gain, offset, radius, d
         Evidence against background and shadow, the smaller of the two.
     """
     h, w = known.shape
+    picture = np.zeros((h, w, 3), np.float32)  # 0 where unknown, as the next three
+    lit = np.zeros((h, w, 3), np.float32)
+    ib, bb = np.zeros((h, w), np.float32), np.zeros((h, w), np.float32)  # sums over the channels of I·B and B²
+    for y in range(h):
+        for x in range(w):
+            if known[y, x]:
+                for c in range(3):
+                    i = np.float32(image[y, x, c])
+                    b = gain[c] * mean[y, x, c] + offset[c]
+                    picture[y, x, c], lit[y, x, c] = i, b
+                    ib[y, x] += i * b
+                    bb[y, x] += b * b
     plane = np.zeros((h, w, 3), np.float32)  # factor at the window's centre, its slopes along x and y
     tint = np.zeros((h, w, 3), np.float32)  # channels' own factors, relative
     misfit = np.full((h, w), np.float32(np.inf), np.float32)
+    possible = np.zeros((h, w), np.bool_)
     for y in range(h):
         for x in range(w):
             if evidence[y, x] > NO_QUESTION and known[y, x]:
-                _fit_window(
-                    image, mean, sigma, known, gain, offset, radius, darkest, lightest, color, y, x, plane, tint, misfit
-                )
+                noise = sigma[y, x] * sigma[y, x]
+                possible[y, x] = _may_be_shadow(picture, lit, ib, bb, noise, darkest, lightest, color, y, x)
+                if possible[y, x]:
+                    _fit_window(
+                        picture, lit, ib, bb, noise, radius, darkest, lightest, color, y, x, plane, tint, misfit
+                    )
     result = evidence.copy()
     for y in range(h):
         for x in range(w):
-            if evidence[y, x] <= NO_QUESTION or not known[y, x]:
+            if not possible[y, x]:
                 continue
             noise = sigma[y, x] * sigma[y, x]
             least = np.float32(np.inf)
@@ -108,8 +124,8 @@ def shadow_evidence(evidence, image, mean, sigma, known, gain, offset, radius, d
                     own = misfit[v, u]
                     factor = plane[v, u, 0] + plane[v, u, 1] * (x - u) + plane[v, u, 2] * (y - v)
                     for c in range(3):
-                        shaded = factor * tint[v, u, c] * (gain[c] * mean[y, x, c] + offset[c])
-                        left = np.float32(image[y, x, c]) - shaded
+                        shaded = factor * tint[v, u, c] * lit[y, x, c]
+                        left = picture[y, x, c] - shaded
                         own += left * left / (noise + color * color * shaded * shaded)
                     least = min(least, own)
             value = max(np.float32(0.5 * least - SHADOW_PRIOR), np.float32(-LIMIT_BACK))
@@ -119,80 +135,92 @@ def shadow_evidence(evidence, image, mean, sigma, known, gain, offset, radius, d
 
 
 @njit(cache=True, nogil=True)
-def _fit_window(image, mean, sigma, known, gain, offset, radius, darkest, lightest, color, y, x, plane, tint, misfit):
-    """Fit the shadow of the window around (y, x); leaves `misfit` infinite where it can't be one."""
-    h, w = known.shape
-    noise = np.float64(sigma[y, x]) ** 2
-
-    # Can any shadow explain the centre itself?
-    ib, bb = 0.0, 1e-6
-    for c in range(3):
-        b = np.float64(gain[c] * mean[y, x, c] + offset[c])
-        ib += image[y, x, c] * b
-        bb += b * b
-    factor = ib / bb
+def _may_be_shadow(picture, lit, ib, bb, noise, darkest, lightest, color, y, x):
+    """Whether any factor at all explains this pixel."""
+    factor = ib[y, x] / (bb[y, x] + np.float32(1e-6))
     if not (0.7 * darkest < factor < 1.3 * lightest):
-        return
-    left = 0.0
+        return False
+    left = np.float32(0.0)
     for c in range(3):
-        b = factor * (gain[c] * mean[y, x, c] + offset[c])
-        left += (image[y, x, c] - b) ** 2 / (noise + (2.0 * color * b) ** 2)
-    if left > HOPELESS:
-        return
+        b = factor * lit[y, x, c]
+        left += (picture[y, x, c] - b) ** 2 / (noise + 4.0 * color * color * b * b)
+    return left <= HOPELESS
 
-    # Factor s0 + s1 du + s2 dv, all channels together: normal equations in the moments of B² and I·B
-    n = 0
-    m00, m10, m01, m20, m11, m02, r0, r1, r2 = 1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6, 0.0, 0.0, 0.0
+
+@njit(cache=True, nogil=True)
+def _fit_window(picture, lit, ib, bb, noise, radius, darkest, lightest, color, y, x, plane, tint, misfit):
+    """Fit the shadow of the window around (y, x); leaves `misfit` infinite where it can't be one."""
+    h, w = ib.shape
     top, bottom = max(0, y - radius), min(h, y + radius + 1)
     first, last = max(0, x - radius), min(w, x + radius + 1)
+
+    # Factor s0 + s1 du + s2 dv, all channels together: normal equations in the moments of B² and I·B
+    m00, m10, m01, m20, m11, m02, r0, r1, r2 = 1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6, 0.0, 0.0, 0.0
     for v in range(top, bottom):
+        n0, n1, n2, q0, q1 = 0.0, 0.0, 0.0, 0.0, 0.0
         for u in range(first, last):
-            if known[v, u]:
-                n += 1
-                ib, bb = 0.0, 0.0
-                for c in range(3):
-                    b = np.float64(gain[c] * mean[v, u, c] + offset[c])
-                    ib += image[v, u, c] * b
-                    bb += b * b
-                du, dv = u - x, v - y
-                m00 += bb
-                m10 += bb * du
-                m01 += bb * dv
-                m20 += bb * du * du
-                m11 += bb * du * dv
-                m02 += bb * dv * dv
-                r0 += ib
-                r1 += ib * du
-                r2 += ib * dv
-    if n < 6:
-        return
+            du = np.float64(u - x)
+            b, r = np.float64(bb[v, u]), np.float64(ib[v, u])
+            n0 += b
+            n1 += b * du
+            n2 += b * du * du
+            q0 += r
+            q1 += r * du
+        dv = np.float64(v - y)
+        m00 += n0
+        m10 += n1
+        m20 += n2
+        m01 += n0 * dv
+        m11 += n1 * dv
+        m02 += n0 * dv * dv
+        r0 += q0
+        r1 += q1
+        r2 += q0 * dv
     c0, c1, c2 = m20 * m02 - m11 * m11, m11 * m01 - m10 * m02, m10 * m11 - m20 * m01
     det = m00 * c0 + m10 * c1 + m01 * c2
     if not det > 1e-9 * m00 * m20 * m02:
         return
-    s0 = (c0 * r0 + c1 * r1 + c2 * r2) / det
-    s1 = (c1 * r0 + (m00 * m02 - m01 * m01) * r1 + (m10 * m01 - m00 * m11) * r2) / det
-    s2 = (c2 * r0 + (m10 * m01 - m00 * m11) * r1 + (m00 * m20 - m10 * m10) * r2) / det
+    s0 = np.float32((c0 * r0 + c1 * r1 + c2 * r2) / det)
+    s1 = np.float32((c1 * r0 + (m00 * m02 - m01 * m01) * r1 + (m10 * m01 - m00 * m11) * r2) / det)
+    s2 = np.float32((c2 * r0 + (m10 * m01 - m00 * m11) * r1 + (m00 * m20 - m10 * m10) * r2) / det)
     if not (darkest <= s0 <= lightest):
         return
 
     # Same colour: the channels' own factors; same texture: what the shadow leaves of the window
-    texture, hue = 0.0, 0.0
-    for c in range(3):
-        ii, ip, pp = 0.0, 0.0, 1e-6
-        for v in range(top, bottom):
-            for u in range(first, last):
-                if known[v, u]:
-                    i = np.float64(image[v, u, c])
-                    p = (s0 + s1 * (u - x) + s2 * (v - y)) * (gain[c] * mean[v, u, c] + offset[c])
-                    ii += i * i
-                    ip += i * p
-                    pp += p * p
-        t = ip / pp
-        tint[y, x, c] = t
-        texture += max(0.0, ii - t * ip) / (noise + color * color * pp / n)
-        hue += (t - 1.0) ** 2 / (noise / pp + color * color)
+    n = 0
+    i0, i1, i2, j0, j1, j2, p0, p1, p2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1e-6, 1e-6, 1e-6
+    for v in range(top, bottom):
+        for u in range(first, last):
+            factor = s0 + s1 * np.float32(u - x) + s2 * np.float32(v - y)
+            n += bb[v, u] > 0
+            a, p = np.float64(picture[v, u, 0]), np.float64(factor * lit[v, u, 0])
+            i0 += a * a
+            j0 += a * p
+            p0 += p * p
+            a, p = np.float64(picture[v, u, 1]), np.float64(factor * lit[v, u, 1])
+            i1 += a * a
+            j1 += a * p
+            p1 += p * p
+            a, p = np.float64(picture[v, u, 2]), np.float64(factor * lit[v, u, 2])
+            i2 += a * a
+            j2 += a * p
+            p2 += p * p
+    if n < 6:
+        return
+    t0, t1, t2 = j0 / p0, j1 / p1, j2 / p2
+    slack = color * color
+    texture = (
+        max(0.0, i0 - t0 * j0) / (noise + slack * p0 / n)
+        + max(0.0, i1 - t1 * j1) / (noise + slack * p1 / n)
+        + max(0.0, i2 - t2 * j2) / (noise + slack * p2 / n)
+    )
+    hue = (
+        (t0 - 1.0) ** 2 / (noise / p0 + slack)
+        + (t1 - 1.0) ** 2 / (noise / p1 + slack)
+        + (t2 - 1.0) ** 2 / (noise / p2 + slack)
+    )
     plane[y, x, 0], plane[y, x, 1], plane[y, x, 2] = s0, s1, s2
+    tint[y, x, 0], tint[y, x, 1], tint[y, x, 2] = t0, t1, t2
     misfit[y, x] = TEXTURE_WEIGHT * max(0.0, texture / (3 * n) - 1.0) + hue
 
 

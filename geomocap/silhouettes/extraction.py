@@ -123,26 +123,28 @@ def clean(mask: np.ndarray, evidence: np.ndarray, settings: SilhouetteSettings) 
     -------
     (H, W) bool
     """
-    # Holes: regions of background that don't reach the border of the image
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
-    total, border = region_sums(labels, evidence, count)
-    h, w = mask.shape
-    x, y, width, height, areas = stats.T
-    enclosed = (x > 0) & (y > 0) & (x + width < w) & (y + height < h)
-    weak = enclosed & (-total < settings.coherence * border)
+    x, y, w, h = cv2.boundingRect(mask.astype(np.uint8))
+    part = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)
+    inner = np.ascontiguousarray(evidence[part])
+
+    # Holes: regions of background that don't reach the border (of the image, or of what surrounds the subject)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((~mask[part]).astype(np.uint8), connectivity=4)
+    total, border = region_sums(labels, inner, count)
+    h, w = labels.shape
+    x, y, width, height, _ = stats.T
+    weak = (x > 0) & (y > 0) & (x + width < w) & (y + height < h) & (-total < settings.coherence * border)
     weak[0] = True
-    mask = weak[labels]
 
     # Pieces
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    if count == 1:
-        return mask
-    total, border = region_sums(labels, evidence, count)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(weak[labels].astype(np.uint8), connectivity=8)
+    total, border = region_sums(labels, inner, count)
     areas = stats[:, cv2.CC_STAT_AREA]
-    least = max(settings.smallest * mask.size, settings.smallest_relative * float(areas[1:].max()))
+    least = max(settings.smallest * mask.size, settings.smallest_relative * float(areas[1:].max(initial=0)))
     keep = (areas >= least) & (total > settings.coherence * border)
     keep[0] = False
-    return keep[labels]
+    result = np.zeros_like(mask)
+    result[part] = keep[labels]
+    return result
 
 
 @njit(cache=True, nogil=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-SAMPLES = 6000
+SAMPLES = 3000
 ITERATIONS = 8
 
 
