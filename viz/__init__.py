@@ -1,1 +1,9 @@
-"""Pictures out: offscreen renderings, plots, the report page."""
+"""Pictures out: offscreen renderings, plots, videos, the report page.
+
+Everything is rendered by casting rays with Open3D (Embree), so neither a screen nor a graphics stack is needed.
+"""
+
+from viz.files import render_file
+from viz.review import review
+
+__all__ = ["render_file", "review"]

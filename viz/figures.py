@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ParamSpec
 
 import matplotlib
@@ -148,7 +148,7 @@ def integrals(paths: Paths, body: np.ndarray) -> Figure:
 
 
 @plot
-def counts(numbers: dict[str, tuple[Sequence[int], np.ndarray]]) -> Figure:
+def counts(numbers: Mapping[str, tuple[Sequence[int], np.ndarray]]) -> Figure:
     """Plot the number of points of each frame: {what: (frames, numbers)}."""
     figure = _figure(9.6, 2.0)
     ax = figure.subplots()

@@ -1,6 +1,10 @@
-"""Colours of the pictures: those of the bodies, and the few that stand for no body."""
+"""Colours of pictures: one for each body, as `geomocap.palette` has them, and those that stand for no body."""
 
-from geomocap.palette import BODY_COLORS, UNASSIGNED, body_color, body_colors, hex_color
+from __future__ import annotations
+
+from geomocap.palette import BODY_COLORS, UNASSIGNED, body_color, body_colors
+
+__all__ = ["ACCENT", "BODY_COLORS", "INK", "UNASSIGNED", "body_color", "body_colors", "hex_color"]
 
 INK = (34, 40, 49)
 """Text and outlines, RGB 0–255."""
@@ -8,4 +12,7 @@ INK = (34, 40, 49)
 ACCENT = (31, 95, 139)
 """Curves and lines that stand for no body, RGB 0–255."""
 
-__all__ = ["ACCENT", "BODY_COLORS", "INK", "UNASSIGNED", "body_color", "body_colors", "hex_color"]
+
+def hex_color(color: tuple[int, int, int]) -> str:
+    """Return an RGB colour as `#rrggbb`."""
+    return "#{:02x}{:02x}{:02x}".format(*color)

@@ -124,41 +124,72 @@ def render(meshes: Sequence[Mesh], view: View, look: Look | None = None, up: np.
     look = look or Look()
     width, height = view.size
     result = np.zeros((height, width, 4), np.float32)
-    window = _window([m for m in meshes if len(m.faces)], view)
-    if window is None:
+    meshes = [m for m in meshes if len(m.faces)]
+    touched = _touched(meshes, view)
+    rows, columns = np.flatnonzero(touched.any(axis=1)), np.flatnonzero(touched.any(axis=0))
+    if len(rows) == 0:
         return Layer(result)
-    left, top, right, bottom = window
+    top, bottom, left, right = int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
     s = look.samples
-    x = left + (np.arange((right - left) * s) + 0.5) / s
-    y = top + (np.arange((bottom - top) * s) + 0.5) / s
-    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    origin, directions = view.rays(pixels)
-    directions = directions.astype(np.float32)
-    shape = (len(y), len(x))
+    wanted = np.repeat(np.repeat(touched[top:bottom, left:right], s, axis=0), s, axis=1)
+    y, x = np.nonzero(wanted)
+    origin, directions = view.rays(np.column_stack([left + (x + 0.5) / s, top + (y + 0.5) / s]))
+    rays = _Rays(origin.astype(np.float32), directions.astype(np.float32), wanted)
 
-    near = _opaque(_surfaces([m for m in meshes if m.alpha >= 1]), origin, directions, shape, look, up)
+    near = _opaque(_surfaces([m for m in meshes if m.alpha >= 1]), rays, look, up)
     clear = _surfaces([m for m in meshes if m.alpha < 1])
-    rgba = near.rgba if clear is None else _peel(clear, origin, directions, near, look, up)
-    result[top:bottom, left:right] = cv2.resize(rgba, (right - left, bottom - top), interpolation=cv2.INTER_AREA)
+    rgba = near.rgba if clear is None else _peel(clear, rays, near, look, up)
+    samples = np.zeros((*wanted.shape, 4), np.float32)
+    samples[wanted] = rgba
+    result[top:bottom, left:right] = cv2.resize(samples, (right - left, bottom - top), interpolation=cv2.INTER_AREA)
     return Layer(result)
 
 
-def _window(meshes: Sequence[Mesh], view: View) -> tuple[int, int, int, int] | None:
-    """Pixel window that holds all of the meshes: left, top, right, bottom."""
-    if not meshes:
-        return None
+@dataclass(frozen=True)
+class _Rays:
+    """The rays worth casting: origin (3,), directions (N, 3), and where they are among all samples, (h, w) bool."""
+
+    origin: np.ndarray
+    directions: np.ndarray
+    wanted: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.directions)
+
+    def spread(self, values: np.ndarray, fill: float) -> np.ndarray:
+        """Return values of the rays (N,) as a picture of all samples."""
+        picture = np.full(self.wanted.shape, fill, values.dtype)
+        picture[self.wanted] = values
+        return picture
+
+
+def _touched(meshes: Sequence[Mesh], view: View) -> np.ndarray:
+    """Pixels (H, W) bool on which a triangle may fall: those of the 8 × 8 tiles that its box meets, and their edges."""
     width, height = view.size
+    if not meshes:
+        return np.zeros((height, width), bool)
     pixels, depth = view.project(np.concatenate([m.vertices for m in meshes]))
     if (depth <= 1e-6).any() or not np.isfinite(pixels).all():
-        return 0, 0, width, height  # something reaches behind the view
-    low = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - 2, 0)
-    high = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 2, [width, height])
-    return None if (low >= high).any() else (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+        return np.ones((height, width), bool)  # something reaches behind the view
+    starts = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
+    corners = pixels[np.concatenate([m.faces + s for m, s in zip(meshes, starts, strict=True)])]
+    margin, tile = 1.5, 8
+    shape = np.array([-(-height // tile), -(-width // tile)])
+    low = np.floor((corners.min(axis=1) - margin) / tile).astype(int)[:, ::-1]
+    high = np.floor((corners.max(axis=1) + margin) / tile).astype(int)[:, ::-1] + 1
+    inside = ((high > 0) & (low < shape)).all(axis=1)
+    low, high = np.clip(low[inside], 0, shape), np.clip(high[inside], 0, shape)
+    counts = np.zeros((shape[0] + 1, shape[1] + 1), np.int64)  # differences, summed below
+    for rows, columns, sign in ((low, low, 1), (high, high, 1), (low, high, -1), (high, low, -1)):
+        index = rows[:, 0] * counts.shape[1] + columns[:, 1]
+        counts += sign * np.bincount(index, minlength=counts.size).reshape(counts.shape)
+    tiles = counts.cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0
+    return np.repeat(np.repeat(tiles, tile, axis=0), tile, axis=1)[:height, :width]
 
 
 @dataclass(frozen=True)
 class _Near:
-    """What is opaque: picture, and distance along the ray (infinite where there is nothing)."""
+    """What is opaque: colour (N, 4), and distance along the ray (N,), infinite where there is nothing."""
 
     rgba: np.ndarray
     distance: np.ndarray
@@ -210,32 +241,24 @@ def _shade(albedo: np.ndarray, normals: np.ndarray, directions: np.ndarray, up: 
     return np.clip(albedo * light[:, None] + 0.10 * shine[:, None], 0, 1)
 
 
-def _opaque(
-    surfaces: _Surfaces | None,
-    origin: np.ndarray,
-    directions: np.ndarray,
-    shape: tuple[int, int],
-    look: Look,
-    up: np.ndarray | None,
-) -> _Near:
-    rgba = np.zeros((len(directions), 4), np.float32)
-    distance = np.full(len(directions), np.inf, np.float32)
+def _opaque(surfaces: _Surfaces | None, rays: _Rays, look: Look, up: np.ndarray | None) -> _Near:
+    rgba = np.zeros((len(rays), 4), np.float32)
     if surfaces is None:
-        return _Near(rgba.reshape(*shape, 4), distance)
-    distance, triangle, uv = _cast(surfaces.scene, origin.astype(np.float32), directions)
+        return _Near(rgba, np.full(len(rays), np.inf, np.float32))
+    distance, triangle, uv = _cast(surfaces.scene, rays.origin, rays.directions)
     hit = np.isfinite(distance)
     if hit.any():
-        triangle, d = triangle[hit], directions[hit]
+        triangle, d = triangle[hit], rays.directions[hit]
         normals = _normals(surfaces, triangle, uv[hit], d)
         color = _shade(surfaces.colors[triangle], normals, d, up)
-        depth_map = distance.reshape(shape)
-        shadow = look.hollows * _hollows(depth_map, look.samples)[hit.reshape(shape)]
-        label = np.zeros(len(directions), np.int64)
+        depth = rays.spread(distance, np.inf)
+        label = np.zeros(len(rays), np.int64)
         label[hit] = surfaces.label[triangle]
-        line = look.outline * _edges(depth_map, label.reshape(shape))[hit.reshape(shape)]
-        rgba[hit, :3] = color * (1 - shadow)[:, None] * (1 - line)[:, None]
+        dark = 1 - look.hollows * _hollows(depth, look.samples)
+        dark *= 1 - look.outline * _edges(depth, rays.spread(label, 0))
+        rgba[hit, :3] = color * dark[rays.wanted][hit, None]
         rgba[hit, 3] = 1
-    return _Near(rgba.reshape(*shape, 4), distance)
+    return _Near(rgba, distance)
 
 
 def _hollows(depth: np.ndarray, samples: int) -> np.ndarray:
@@ -270,23 +293,21 @@ def _edges(depth: np.ndarray, label: np.ndarray) -> np.ndarray:
     return dark * (label > 0)
 
 
-def _peel(
-    clear: _Surfaces, origin: np.ndarray, directions: np.ndarray, near: _Near, look: Look, up: np.ndarray | None
-) -> np.ndarray:
-    """Composite translucent layers, front to back, and what is opaque behind them."""
-    rgba = np.zeros((len(directions), 4), np.float32)
-    start = np.broadcast_to(origin.astype(np.float32), directions.shape).copy()
-    travelled = np.zeros(len(directions), np.float32)
-    alive = np.arange(len(directions))
+def _peel(clear: _Surfaces, rays: _Rays, near: _Near, look: Look, up: np.ndarray | None) -> np.ndarray:
+    """Composite translucent layers, front to back, and what is opaque behind them: (N, 4)."""
+    rgba = np.zeros((len(rays), 4), np.float32)
+    start = np.broadcast_to(rays.origin, rays.directions.shape).copy()
+    travelled = np.zeros(len(rays), np.float32)
+    alive = np.arange(len(rays))
     for _ in range(look.layers):
         if len(alive) == 0:
             break
-        distance, triangle, uv = _cast(clear.scene, start[alive], directions[alive])
+        distance, triangle, uv = _cast(clear.scene, start[alive], rays.directions[alive])
         seen = np.isfinite(distance) & (travelled[alive] + distance < near.distance[alive])
         alive, distance, triangle, uv = alive[seen], distance[seen], triangle[seen], uv[seen]
         if len(alive) == 0:
             break
-        d = directions[alive]
+        d = rays.directions[alive]
         normals = _normals(clear, triangle, uv, d)
         facing = np.clip(-np.einsum("ij,ij->i", normals, d), 0, 1)
         alpha = np.clip(clear.alpha[triangle] + clear.rim[triangle] * (1 - facing) ** 2, 0, 1)
@@ -297,6 +318,4 @@ def _peel(
         step = distance * np.float32(1 + 1e-5) + np.float32(1e-5)
         travelled[alive] += step
         start[alive] += step[:, None] * d
-    behind = near.rgba.reshape(-1, 4)
-    rgba += (1 - rgba[:, 3:]) * behind
-    return rgba.reshape(near.rgba.shape)
+    return rgba + (1 - rgba[:, 3:]) * near.rgba

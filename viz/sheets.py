@@ -156,7 +156,7 @@ def silhouette_sheet(results: Results, frames: Sequence[int], width: int = 250) 
 
 
 def _named(image: np.ndarray, name: str) -> np.ndarray:
-    return write_on(image, name, (6, 6), 11, bold=True, plate=(255, 255, 255))
+    return write_on(image, name, (7, 7), 12, bold=True, plate=(255, 255, 255))
 
 
 def overlay(
@@ -182,7 +182,7 @@ def overlay_sheet(
 
     def tile(job: tuple[str, int]) -> np.ndarray:
         camera, frame = job
-        drawn = overlay(results, camera, frame, built[frame], 400, opacity)
+        drawn = overlay(results, camera, frame, built[frame], 340, opacity)
         return _named(drawn, camera if len(frames) == 1 else f"{camera}, frame {frame}")
 
     with threads() as executor:

@@ -1,0 +1,152 @@
+"""The renderer against analytic projections and compositing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from geomocap.cameras import Rig
+from viz.render import Layer, Look, render
+from viz.shapes import EMPTY, ball, ellipsoid, tube
+from viz.views import CameraView, PinholeView, Stage, camera_view, look, stage_of
+
+UP = np.array([0.0, 0.0, 1.0])
+PLAIN = Look(samples=4, outline=0, hollows=0)
+
+
+def rig(params: list[float] | None = None) -> Rig:
+    model = "OPENCV" if params else "PINHOLE"
+    values = [150.0, 150.0, 61.5, 42.0, *(params or [])]
+    camera = pycolmap.Camera(model=model, width=120, height=90, params=values)
+    return Rig(("a",), (camera,), look(np.array([3.0, -0.5, 1.2]), np.array([0, 0, 1.0]), UP)[None])
+
+
+def cone_mask(view: CameraView, center: np.ndarray, radius: float) -> np.ndarray:
+    """Share of each pixel whose rays meet a sphere, from 8 × 8 rays a pixel."""
+    width, height = view.size
+    s = 8
+    grid = np.stack(np.meshgrid((np.arange(width * s) + 0.5) / s, (np.arange(height * s) + 0.5) / s), axis=-1)
+    origin, directions = view.rays(grid.reshape(-1, 2))
+    to = center - origin
+    along = directions @ to
+    met = (to @ to - along**2 < radius**2).astype(float)
+    return met.reshape(height, s, width, s).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("params", [None, [-0.25, 0.08, 0.002, -0.001]])
+@pytest.mark.parametrize("size", [(120, 90), (60, 45)])
+def test_sphere_covers_its_analytic_projection(params: list[float] | None, size: tuple[int, int]) -> None:
+    view = CameraView(rig(params), 0, size)
+    center, radius = np.array([0.1, 0.15, 1.05]), 0.35
+    seen = render([ball(center, radius, (200, 0, 0), level=24)], view, PLAIN).rgba[..., 3]
+    expected = cone_mask(view, center, radius)
+    assert abs(seen.sum() - expected.sum()) < 0.005 * expected.sum()
+    assert np.abs(seen - expected).max() < 0.35  # of a pixel
+    y, x = np.mgrid[: size[1], : size[0]]
+    for coordinate in (x, y):  # a shift by half a pixel would show here
+        shift = (seen * coordinate).sum() / seen.sum() - (expected * coordinate).sum() / expected.sum()
+        assert abs(shift) < 0.02
+
+
+def test_point_projects_where_its_ray_comes_from() -> None:
+    view = camera_view(rig([-0.2, 0.05, 0, 0]), 0, 60)
+    assert view.size == (60, 45)
+    pixels = np.array([[10.0, 8.0], [30.5, 22.5], [55.0, 40.0]])
+    origin, directions = view.rays(pixels)
+    back, depth = view.project(origin + 2.5 * directions)
+    np.testing.assert_allclose(back, pixels, atol=1e-6)
+    assert (depth > 0).all()
+
+
+def test_nearer_surface_hides_the_one_behind() -> None:
+    view = camera_view(rig(), 0)
+    near, far = ball([0.6, 0, 1], 0.2, (250, 0, 0)), ball([-0.6, 0.1, 1], 0.4, (0, 0, 250))
+    for meshes in ([near, far], [far, near]):
+        image = render(meshes, view, PLAIN).over((255, 255, 255))
+        (x, y), *_ = view.project(np.array([[0.6, 0, 1.0]]))[0]
+        r, _, b = image[int(y), int(x)].astype(int)
+        assert r > b + 60
+
+
+def test_translucent_layers_composite_front_to_back() -> None:
+    view = camera_view(rig(), 0)
+    glass = ball([0, 0, 1], 0.3, (0, 200, 0), level=10).translucent(0.5, rim=0.0)
+    (x, y), *_ = (int(v) for v in view.project(np.array([[0, 0, 1.0]]))[0][0]), 0
+    two = render([glass], view, Look(samples=2, layers=2)).rgba[y, x, 3]
+    one = render([glass], view, Look(samples=2, layers=1)).rgba[y, x, 3]
+    assert one == pytest.approx(0.5, abs=1e-3)
+    assert two == pytest.approx(0.75, abs=1e-3)
+    core = ball([0, 0, 1], 0.1, (200, 0, 0), level=6)
+    filled = render([glass, core], view, Look(samples=2, layers=2, outline=0, hollows=0)).rgba[y, x]
+    assert filled[3] == pytest.approx(1.0, abs=1e-3)
+    alone = render([core], view, PLAIN).rgba[y, x, 0]
+    assert filled[0] == pytest.approx(0.5 * alone, abs=0.06)  # half of the red core shines through one layer
+
+
+def test_layer_over_photograph() -> None:
+    rgba = np.zeros((2, 2, 4), np.float32)
+    rgba[0, 0] = [0.5, 0, 0, 0.5]
+    photograph = np.full((2, 2, 3), 100, np.uint8)
+    image = Layer(rgba).over(photograph)
+    assert image[0, 0].tolist() == [178, 50, 50]
+    assert image[1, 1].tolist() == [100, 100, 100]
+    assert Layer(rgba).over(photograph, opacity=0)[0, 0].tolist() == [100, 100, 100]
+
+
+def test_rendering_repeats_to_the_bit() -> None:
+    view = camera_view(rig(), 0)
+    meshes = [
+        ball([0, 0, 1], 0.3, (9, 200, 9)).translucent(0.3),
+        ellipsoid([0, 0, 1], [0.1, 0.2, 0.05], np.eye(3), (9, 9, 99)),
+    ]
+    assert np.array_equal(render(meshes, view).rgba, render(meshes, view).rgba)
+
+
+def test_nothing_and_out_of_sight_give_an_empty_layer() -> None:
+    view = camera_view(rig(), 0)
+    for meshes in ([], [EMPTY], [ball([0, 50, 1], 0.1, (1, 2, 3))]):
+        assert not render(meshes, view).rgba.any()
+
+
+def test_something_behind_the_view_does_not_hide_what_is_in_front() -> None:
+    view = camera_view(rig(), 0)
+    through = tube(np.array([[6.0, -1.2, 1.2], [-3.0, 0.6, 0.9]]), 0.02, (1, 2, 3))
+    assert render([through, ball([0, 0, 1], 0.2, (200, 0, 0))], view).rgba[..., 3].sum() > 50
+
+
+@settings(max_examples=25, deadline=None)
+@given(azimuth=st.floats(-180, 180), elevation=st.floats(-80, 89), seed=st.integers(0, 99), wide=st.booleans())
+def test_free_views_take_in_everything(azimuth: float, elevation: float, seed: int, wide: bool) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(200, 3)) * ([2, 0.5, 1] if wide else [0.2, 0.3, 1.5])
+    stage = Stage(points, np.array([[5.0, -3.0, 1.0]]), UP, np.array([1.0, 0, 0]), 0.0)
+    view = stage.view(azimuth, elevation, (200, 150))
+    pixels, depth = view.project(points + stage.centers[0])
+    assert (depth > 0).all()
+    assert (pixels > 0).all() and (pixels < [200, 150]).all()
+    assert np.ptp(pixels, axis=0).max() > 90  # and not from too far away
+
+
+def test_views_stand_still_on_the_spot_and_follow_a_traveller() -> None:
+    rng = np.random.default_rng(0)
+    body = rng.normal(size=(500, 3)) * 0.2
+    on_the_spot = stage_of([body, body + 0.05], [0, 9], 10, UP)
+    assert np.ptp(on_the_spot.centers, axis=0).max() == 0
+    walking = stage_of([body + np.array([0.0, t, 0]) for t in range(0, 10, 3)], [0, 3, 6, 9], 10, UP)
+    np.testing.assert_allclose(np.diff(walking.centers, axis=0), [[0, 1.0, 0]] * 9, atol=0.05)
+    view = walking.view(0, 10, (100, 100))
+    a = view.project(body)[0]
+    b = walking.at(view, 9).project(body + np.array([0, 9.0, 0]))[0]
+    assert np.abs(a - b).max() < 3
+
+
+def test_pinhole_view_moves() -> None:
+    view = PinholeView(
+        (10, 10), np.array([[9.0, 0, 5], [0, 9, 5], [0, 0, 1]]), look(np.array([2.0, 0, 0]), np.zeros(3), UP)
+    )
+    point = np.array([[0.1, 0.2, -0.1]])
+    offset = np.array([3.0, 2.0, 1.0])
+    np.testing.assert_allclose(view.moved(offset).project(point + offset)[0], view.project(point)[0])

@@ -1,0 +1,268 @@
+"""A whole review of a small run: sheets, plots, video, report; and of runs in which parts are missing."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import av
+import numpy as np
+import open3d as o3d
+import pytest
+from PIL import Image
+
+from geomocap.errors import GeometryError, RunError
+from geomocap.run import Run
+from tests.viz.conftest import LIMBS, Made
+from viz import render_file, review
+from viz.quality import assess, coverage, relative_paths
+from viz.report import Block, Report, Section, render_html, table, video
+from viz.results import Results, ply_count, read_points
+from viz.scene import stage
+from viz.sheets import overlay
+from viz.video import best_camera, write_video
+
+
+@pytest.fixture(scope="session")
+def reviewed(made: Made) -> list[Path]:
+    calls: list[tuple[str, int, int]] = []
+    files = review(made.run, made.capture, frames=[0, 5], progress=lambda *call: calls.append(call))
+    assert calls[0][1] == 0 and all(d <= n for _, d, n in calls) and calls[-1][1] == calls[-1][2]
+    return files
+
+
+def test_review_writes_every_picture_and_the_report_last(made: Made, reviewed: list[Path]) -> None:
+    assert all(f.is_file() and f.parent == made.run.path / "review" for f in reviewed)
+    assert not list((made.run.path / "review").glob(".*"))
+    names = {f.stem for f in reviewed}
+    assert reviewed[-1].name == "report.html"
+    assert {"motion", "stages", "cameras", "silhouettes", "volume", "ellipsoids", "paths", "bodies"} <= names
+    assert {"skeleton", "skeleton_overlay", "joint_angles", "integrals", "timings"} <= names
+    for file in reviewed:
+        if file.suffix == ".png":
+            with Image.open(file) as image:
+                pixels = np.asarray(image.convert("RGB"))
+            assert min(pixels.shape[:2]) > 100 and pixels.std() > 5, file.name
+
+
+def test_video_is_what_browsers_play(reviewed: list[Path]) -> None:
+    file = next(f for f in reviewed if f.suffix == ".mp4")
+    data = file.read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat")  # the index first
+    with av.open(str(file)) as container:
+        stream = container.streams.video[0]
+        assert stream.codec_context.name == "h264"
+        assert stream.codec_context.pix_fmt == "yuv420p"
+        assert stream.width % 2 == 0 and stream.height % 2 == 0
+        assert float(stream.average_rate) == 30
+        assert sum(1 for _ in container.decode(stream)) == 6
+
+
+def test_report_is_one_self_contained_page(reviewed: list[Path]) -> None:
+    page = reviewed[-1].read_text(encoding="utf-8")
+    assert len(page) < 15_000_000
+    sources = re.findall(r"""(?:src|href|poster|data)\s*=\s*["']([^"']*)""", page)
+    assert len(sources) > 20
+    assert all(s.startswith(("data:image/", "data:video/mp4;base64,", "#")) for s in sources)
+    assert not re.search(r"@import|url\(|<script|<link", page)
+    anchors = set(re.findall(r'href="#([^"]*)"', page))
+    assert anchors and anchors <= set(re.findall(r'id="([^"]*)"', page))
+    for word in ("stick figure", "10 rigid bodies", "9 joints", "forearm_l", "cam1", "resolution = 128", "silhouettes"):
+        assert word in page
+    assert "The run has no" not in page
+
+
+def test_review_repeats_to_the_bit(made: Made, reviewed: list[Path]) -> None:
+    before = {f.name: f.read_bytes() for f in reviewed}
+    again = review(made.run, made.capture, frames=[0, 5])
+    assert {f.name for f in again} == set(before)
+    assert [f.name for f in again if f.read_bytes() != before[f.name]] == []
+
+
+@pytest.mark.parametrize(
+    ("kept", "sentence"),
+    [
+        (["silhouettes"], "holds no geometry yet"),
+        (["voxels"], "has no skeleton"),
+        (["ellipsoids.npz"], "has no rigid bodies"),
+        (["bodies", "skeleton.npz"], "has neither voxels nor a point cloud"),
+    ],
+)
+def test_missing_parts_are_named_and_left_out(made: Made, tmp_path: Path, kept: list[str], sentence: str) -> None:
+    for name in kept:
+        source = made.run.path / name
+        if source.is_dir():
+            shutil.copytree(source, tmp_path / "run" / name)
+            for late in (tmp_path / "run" / name).rglob("00000[2-5].*"):
+                late.unlink()
+        else:
+            (tmp_path / "run").mkdir(exist_ok=True)
+            shutil.copy(source, tmp_path / "run" / name)
+    files = review(Run(tmp_path / "run"), None, frames=[0])
+    page = files[-1].read_text(encoding="utf-8")
+    assert sentence in page
+    assert "No capture is at hand" in page
+
+
+def test_one_scan_has_no_video_and_no_paths(made: Made, tmp_path: Path) -> None:
+    positions, _ = made.figure.points(0, 200)
+    (tmp_path / "cloud").mkdir()
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(positions.astype(np.float32)))
+    o3d.t.io.write_point_cloud(str(tmp_path / "cloud" / "000000.ply"), cloud)
+    files = review(Run(tmp_path))
+    assert not [f for f in files if f.suffix == ".mp4"]
+    assert "a scan" in files[-1].read_text(encoding="utf-8")
+
+
+def test_empty_run_and_unknown_frame_are_refused(made: Made, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="holds no silhouettes and no geometry"):
+        review(Run(tmp_path))
+    with pytest.raises(RunError, match="frame 77 is not in the run; choose from 0 to 5"):
+        review(made.run, made.capture, frames=[77])
+
+
+def test_damaged_arrays_are_named(made: Made, tmp_path: Path) -> None:
+    shutil.copytree(made.run.path / "voxels", tmp_path / "voxels")
+    Run(tmp_path).write_npz("skeleton.npz", joint_positions=np.zeros((6, 1, 3)))
+    with pytest.raises(RunError, match=r"skeleton\.npz: has no array joint_bodies"):
+        review(Run(tmp_path))
+
+
+# --- parts ---
+
+
+def test_results_read_what_was_written(made: Made) -> None:
+    results = Results(made.run, made.capture)
+    assert results.frames == list(range(6)) and results.up == "z" and results.fps == 30
+    assert results.skeleton is not None
+    assert results.skeleton.leaves == [1, 3, 5, 7, 9]
+    assert {b for b, _, _ in results.skeleton.bones} == {0, 2, 4, 6, 8}
+    assert results.counts["voxels"][0] == len(results.voxels(0).indices)
+    assert ply_count(made.run.frame_file("bodies", 0)) == len(results.bodies(0).positions)
+    assert set(np.unique(results.bodies(0).bodies)) == set(range(-1, len(LIMBS)))
+    turned = results.skeleton.joint_rotations()
+    swing = LIMBS[2][5] * np.sin(2 * np.pi * 5 / 30)
+    np.testing.assert_allclose(turned[5, 1], [np.degrees(swing), 0, 0], atol=1e-6)
+
+
+def test_overlay_lies_on_the_photographed_figure(made: Made) -> None:
+    """The figure was drawn through the distorted cameras; its rendering must fall on the same pixels."""
+    from viz.palette import body_color
+    from viz.scene import body_skin
+
+    results = Results(made.run, made.capture)
+    red = body_skin(results, 3).recolored((255, 0, 0))
+    changed = overlay(results, "cam1", 3, [red], 160).astype(int)
+    painted = changed[..., 0] - changed[..., 1] > 60
+    mask = results.silhouette("cam1", 3)
+    assert mask is not None
+    inside = mask > 0
+    assert (painted & inside).sum() / (painted | inside).sum() > 0.8
+    assert body_color(0) != (255, 0, 0)
+
+
+def test_quality_of_the_figure(made: Made) -> None:
+    quality = assess(Results(made.run, made.capture), [0, 3])
+    assert all(covered > 0.95 for covered, _ in quality.agreement.values())
+    assert max(b.spread for b in quality.bones) < 1e-9
+    assert quality.unassigned == pytest.approx(1 / 97, rel=0.1)
+    assert not [w for w in quality.warnings if "bones" in w or "joints" in w]
+
+
+def test_warnings_say_what_is_wrong(made: Made, tmp_path: Path) -> None:
+    shutil.copytree(made.run.path, tmp_path / "run")
+    run = Run(tmp_path / "run")
+    arrays = run.read_npz("skeleton.npz")
+    arrays["joint_positions"][::2, 3] += 0.3
+    run.write_npz("skeleton.npz", **arrays)
+    Image.new("L", (160, 120)).save(run.silhouette_file("cam0", 2))
+    (run.path / "diagnostics.json").write_text('{"warnings": ["the light changes"]}')
+    said = " ".join(assess(Results(run, made.capture), [0]).warnings)
+    assert "cam0: the silhouette is empty in 1 of 6 frames" in said
+    assert "jump from frame to frame: arm_r" in said
+    assert "bones change their length" in said
+    assert "the light changes" in said
+
+
+def test_coverage_notices_the_border(made: Made, tmp_path: Path) -> None:
+    mask = np.zeros((40, 60), np.uint8)
+    mask[10:20, 50:] = 255
+    file = Run(tmp_path).silhouette_file("a", 0)
+    file.parent.mkdir(parents=True)
+    Image.fromarray(mask).save(file)
+    found = coverage(Results(Run(tmp_path)))
+    assert found is not None
+    assert found.share[0, 0] == pytest.approx(100 / 2400)
+    assert found.cut[0, 0]
+
+
+def test_relative_paths_of_one_body_have_no_distance(made: Made) -> None:
+    results = Results(made.run)
+    e = results.ellipsoids
+    assert e is not None
+    paths = relative_paths(e, {"seeds": np.array([10]), "threshold": np.array(0.02)})
+    assert paths.seed == 10 and paths.threshold == 0.02  # 0 and 10 are the trunk's, which does not turn
+    np.testing.assert_allclose(paths.distance[:, 0], 0, atol=1e-12)
+    np.testing.assert_allclose(np.diag(paths.integrals), 0)
+    assert paths.integrals[10, 3] > 0.005
+
+
+def test_video_camera_looks_at_the_broad_side(made: Made) -> None:
+    results = Results(made.run, made.capture)
+    place = stage(results)
+    camera = best_camera(results, place)
+    assert camera in made.rig.names
+    assert best_camera(Results(made.run), place) is None
+
+
+def test_odd_sizes_are_made_even(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", [np.full((33, 51, 3), 90, np.uint8)] * 3, 12.5)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert (container.streams.video[0].width, container.streams.video[0].height) == (52, 34)
+    with pytest.raises(RunError, match="no frames"):
+        write_video(tmp_path / "b.mp4", [], 12.5)
+    assert not (tmp_path / "b.mp4").exists()
+
+
+def test_text_in_the_report_is_escaped() -> None:
+    blocks = (Block("text", "<script>alert(1)</script>"), table(("a",), [("<b>",)]))
+    page = render_html(Report("A & B", "", sections=(Section("S", "s", blocks), Section("Empty", "e", ()))))
+    assert "<script" not in page and "&lt;b&gt;" in page and "A &amp; B" in page
+    assert "Empty" not in page
+
+
+def test_large_videos_are_linked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "motion.mp4"
+    file.write_bytes(b"x" * 100)
+    assert video(file, "", "").source.startswith("data:video/mp4;base64,")
+    monkeypatch.setattr("viz.report.EMBEDDED_VIDEO", 10)
+    assert video(file, "", "").source == "motion.mp4"
+
+
+def test_any_geometry_file_gets_a_picture(made: Made, tmp_path: Path) -> None:
+    box = o3d.geometry.TriangleMesh.create_box(1, 2, 3)
+    o3d.io.write_triangle_mesh(str(tmp_path / "box.ply"), box)
+    files = [tmp_path / "box.ply", made.run.frame_file("voxels", 0), made.run.frame_file("bodies", 0)]
+    for k, file in enumerate(files):
+        target = render_file(file, tmp_path / f"{k}.png")
+        with Image.open(target) as image:
+            assert np.asarray(image).std() > 5
+    assert render_file(tmp_path / "box.ply") == tmp_path / "box.png"
+    for name, content, words in (
+        ("no.ply", None, "no such file"),
+        ("a.txt", "x", "can't be shown"),
+        ("b.stl", "solid", "holds no triangles"),
+    ):
+        if content is not None:
+            (tmp_path / name).write_text(content)
+        with pytest.raises(GeometryError, match=words):
+            render_file(tmp_path / name)
+
+
+def test_points_without_colours_or_bodies(tmp_path: Path) -> None:
+    positions = np.array([[0, 0, 0], [1, 2, 3], [np.nan, 0, 0]], np.float32)
+    o3d.t.io.write_point_cloud(str(tmp_path / "a.ply"), o3d.t.geometry.PointCloud(o3d.core.Tensor(positions)))
+    points = read_points(tmp_path / "a.ply")
+    assert len(points.positions) == 2 and points.colors.shape == (2, 3)
+    assert points.bodies is None and points.normals is None

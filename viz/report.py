@@ -1,0 +1,125 @@
+"""The report: one self-contained HTML page of sections, each a list of blocks."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import jinja2
+import numpy as np
+
+from geomocap.files import write_text
+from viz.drawing import jpeg
+
+EMBEDDED_VIDEO = 6_000_000
+"""Videos up to this many bytes go into the page; larger ones are linked beside it."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A piece of a section: text, a picture, a table and so on, as `kind` says."""
+
+    kind: Literal["text", "missing", "heading", "fine", "warnings", "picture", "video", "table", "code"]
+    text: str = ""
+    title: str = ""
+    source: str = ""
+    width: int = 0
+    items: tuple[str, ...] = ()
+    head: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+    numbers: tuple[int, ...] = ()
+    colors: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Section:
+    """A titled part of the report, with an anchor for the table of contents."""
+
+    title: str
+    anchor: str
+    blocks: tuple[Block, ...]
+
+
+@dataclass(frozen=True)
+class Report:
+    """A whole report."""
+
+    title: str
+    lead: str
+    key_figures: tuple[tuple[str, str], ...] = ()
+    sections: tuple[Section, ...] = ()
+    footer: str = field(default="Made by geomocap.")
+
+
+def text(words: str) -> Block:
+    """Return a paragraph."""
+    return Block("text", words)
+
+
+def missing(words: str) -> Block:
+    """Return a sentence about what isn't there."""
+    return Block("missing", words)
+
+
+def picture(image: np.ndarray, title: str, words: str) -> Block:
+    """Return an image (H, W, 3) uint8 with a caption, embedded as JPEG."""
+    return Block("picture", words, title, _data_uri("image/jpeg", jpeg(image)), image.shape[1])
+
+
+def plot(png: bytes, title: str, words: str) -> Block:
+    """Return a plot with a caption, embedded as PNG."""
+    return Block("picture", words, title, _data_uri("image/png", png))
+
+
+def video(file: Path, title: str, words: str) -> Block:
+    """Return a video with a caption: embedded if it is small, otherwise linked by its name beside the page."""
+    small = file.stat().st_size <= EMBEDDED_VIDEO
+    source = _data_uri("video/mp4", file.read_bytes()) if small else file.name
+    return Block("video", words, title, source)
+
+
+def table(
+    head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = (), colors: Sequence[str] = ()
+) -> Block:
+    """Return a table; `numbers` are the columns set flush right, `colors` swatches before the rows' first cells."""
+    return Block(
+        "table", head=tuple(head), rows=tuple(tuple(r) for r in rows), numbers=tuple(numbers), colors=tuple(colors)
+    )
+
+
+def _data_uri(kind: str, data: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+
+
+@cache
+def _template() -> jinja2.Template:
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("viz"), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
+    )
+    return environment.get_template("report.html")
+
+
+def render_html(report: Report) -> str:
+    """Return the page's HTML."""
+    return _template().render(
+        title=report.title,
+        lead=report.lead,
+        key_figures=report.key_figures,
+        sections=[s for s in report.sections if s.blocks],
+        footer=report.footer,
+    )
+
+
+def write_report(path: Path, report: Report) -> None:
+    """Write the page, whole or not at all.
+
+    Raises
+    ------
+    RunError
+        If it can't be written.
+    """
+    write_text(path, render_html(report))

@@ -1,0 +1,291 @@
+"""Everything there is to look at of a run: picture sheets, a video and the report, made from the run's files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from geomocap.capture import Capture
+from geomocap.errors import GeometryError, RunError
+from geomocap.files import write_atomic
+from geomocap.progress import Progress, silent
+from geomocap.run import Run
+from viz import figures, sheets
+from viz.drawing import write_png
+from viz.quality import Quality, assess, relative_paths
+from viz.report import Block, Report, missing, picture, plot, video, write_report
+from viz.results import Results
+from viz.scene import stage as find_stage
+from viz.sections import (
+    bodies_table,
+    cameras_table,
+    figures_of_quality,
+    key_figures,
+    lead,
+    record_blocks,
+    section,
+    summary,
+    timings_table,
+    title,
+)
+from viz.video import motion_video
+from viz.views import Stage
+
+
+@dataclass
+class Desk:
+    """What is being written: files in RUN/review, and their progress."""
+
+    folder: Path
+    progress: Progress
+    total: int
+    written: list[Path] = field(default_factory=list)
+    done: int = 0
+
+    def step(self) -> None:
+        """Report one more part as done."""
+        self.done += 1
+        self.progress("review", min(self.done, self.total), self.total)
+
+    def sheet(self, name: str, image: np.ndarray | None, heading: str, words: str) -> list[Block]:
+        """Write a picture as PNG and return its block; nothing if there is no picture."""
+        self.step()
+        if image is None:
+            return []
+        path = self.folder / f"{name}.png"
+        write_png(path, image)
+        self.written.append(path)
+        return [picture(image, heading, words)]
+
+    def plot(self, name: str, png: bytes, heading: str, words: str) -> list[Block]:
+        """Write a plot and return its block."""
+        self.step()
+        path = self.folder / f"{name}.png"
+        write_atomic(path, lambda p: p.write_bytes(png))
+        self.written.append(path)
+        return [plot(png, heading, words)]
+
+
+def review(
+    run: Run,
+    capture: Capture | None = None,
+    *,
+    frames: Sequence[int] | None = None,
+    progress: Progress = silent,
+) -> list[Path]:
+    """Write picture sheets, a video and `report.html` of a run into RUN/review, from the files that are there.
+
+    Parts that are missing are left out and named in the report.
+
+    Parameters
+    ----------
+    run : Run
+    capture : Capture, optional
+        What the run was made from: needed for everything drawn over the images.
+    frames : sequence of int, optional
+        Frames for the sheets; four evenly spread ones if not given.
+    progress : Progress
+        Called as stage "review", and "video" while the video is drawn.
+
+    Returns
+    -------
+    list of Path
+        The files written, the report last.
+
+    Raises
+    ------
+    RunError
+        If the run holds nothing that could be shown, a file is damaged, or the folder can't be written.
+    GeometryError
+        If a geometry file is damaged.
+    """
+    results = Results(run, capture)
+    if not results.frames:
+        raise RunError(f"{run.path}: holds no silhouettes and no geometry; run a stage first")
+    chosen = list(frames) if frames is not None else sheets.chosen_frames(results.frames, 4)
+    unknown = [f for f in chosen if f not in results.frames]
+    if unknown or not chosen:
+        raise RunError(
+            f"{run.path}: frame {unknown[0] if unknown else '(none)'} is not in the run; "
+            f"choose from {results.frames[0]} to {results.frames[-1]}"
+        )
+    try:
+        stage = find_stage(results)
+    except GeometryError:
+        stage = None
+    desk = Desk(run.path / "review", progress, 18)
+    progress("review", 0, desk.total)
+    quality = assess(results, chosen)
+    desk.step()
+    parts = [
+        section("Result", [*summary(quality), *_result(results, stage, chosen, desk)]),
+        section("What went in", _inputs(results, stage, chosen, desk)),
+        section("Silhouettes", _silhouettes(results, quality, chosen, desk)),
+        section("Volume and points", _volume(results, stage, chosen, desk)),
+        section("Ellipsoids and their paths", _ellipsoids(results, stage, chosen, desk)),
+        section("Rigid bodies", _bodies(results, stage, chosen, desk)),
+        section("Skeleton and motion", _skeleton(results, stage, quality, chosen, desk)),
+        section("Quality", figures_of_quality(results, quality)),
+        section("Time", _times(results, desk)),
+        section("Settings and versions", record_blocks(results)),
+    ]
+    page = desk.folder / "report.html"
+    write_report(page, Report(title(results), lead(results), key_figures(results), tuple(parts)))
+    progress("review", desk.total, desk.total)
+    return [*desk.written, page]
+
+
+def _result(results: Results, stage: Stage | None, frames: list[int], desk: Desk) -> list[Block]:
+    if stage is None:
+        return [missing("The run holds no geometry yet, so there is no result to show; the silhouettes are below.")]
+    blocks = []
+    if len(results.frames) > 1:
+        path = desk.folder / "motion.mp4"
+        motion_video(results, stage, path, progress=desk.progress)
+        desk.written.append(path)
+        over = ", and over the image of one camera" if _calibrated(results) else ""
+        words = "Look for limbs that keep their colour, joints that stay inside the volume, and bones that don't jump."
+        blocks.append(video(path, "The motion", f"From a slowly turning free view{over}. {words}"))
+    desk.step()
+    rows: list[tuple[str, sheets.Builder]] = []
+    if {"voxels", "cloud"} & set(results.kinds):
+        rows.append(("volume" if "voxels" in results.kinds else "points", sheets.volume_meshes))
+    if results.ellipsoids is not None:
+        rows.append(("ellipsoids", sheets.ellipsoid_meshes))
+    if "bodies" in results.kinds:
+        rows.append(("bodies", sheets.body_meshes))
+    if results.skeleton is not None:
+        rows.append(("skeleton", sheets.skeleton_meshes))
+    words = (
+        "Each column is a frame, each row a stage of the work, seen from the same place. "
+        "A body has the same colour in every picture of this report."
+    )
+    return blocks + desk.sheet("stages", sheets.story_sheet(results, stage, frames, rows), "Stage by stage", words)
+
+
+def _inputs(results: Results, stage: Stage | None, frames: list[int], desk: Desk) -> list[Block]:
+    if results.capture is None:
+        desk.step()
+        return [missing("No capture is at hand (the geometry came from elsewhere), so there are no cameras or images.")]
+    blocks: list[Block] = [cameras_table(results)]
+    if stage is not None:
+        words = "Where the cameras stand and what they look at. Check that up is up, and that the distances are right."
+        blocks += desk.sheet("cameras", sheets.cameras_picture(results, stage, frames[0]), "The cameras", words)
+    words = f"Frame {frames[0]} as each camera saw it."
+    return blocks + desk.sheet("images", sheets.camera_images(results, frames[0]), "The images", words)
+
+
+def _silhouettes(results: Results, quality: Quality, frames: list[int], desk: Desk) -> list[Block]:
+    image = sheets.silhouette_sheet(results, frames)
+    if image is None or quality.coverage is None:
+        desk.step()
+        return [missing("The run has no silhouettes.")]
+    words = (
+        "The line should follow the subject's outline, with nothing of it left out: what one camera misses is cut out "
+        "of the volume. The figure is the share of the image inside."
+    )
+    blocks = desk.sheet("silhouettes", image, "Silhouettes", words)
+    words = "Even curves are good; a sudden step means that background was taken for the subject, or the reverse."
+    return blocks + desk.plot("coverage", figures.coverage(quality.coverage), "Coverage", words)
+
+
+def _volume(results: Results, stage: Stage | None, frames: list[int], desk: Desk) -> list[Block]:
+    kind = next((k for k in ("voxels", "cloud") if k in results.kinds), None)
+    if stage is None or kind is None:
+        return [missing("The run has neither voxels nor a point cloud.")]
+    words = (
+        "The volume in its own colours from four sides. Look for limbs grown together, phantom parts where no camera "
+        "could tell empty from full, and parts cut off."
+    )
+    blocks = desk.sheet(
+        "volume", sheets.geometry_sheet(results, stage, frames, sheets.volume_meshes), kind.title(), words
+    )
+    numbers = {k: (results.run.frames(k), v) for k, v in results.counts.items() if k != "bodies"}
+    if numbers and len(results.frames) > 1:
+        words = "Surface voxels or points in each frame. Jumps point to frames with bad silhouettes."
+        blocks += desk.plot("counts", figures.counts(numbers), "Numbers", words)
+    return blocks
+
+
+def _ellipsoids(results: Results, stage: Stage | None, frames: list[int], desk: Desk) -> list[Block]:
+    e = results.ellipsoids
+    if stage is None or e is None:
+        return [missing("The run has no ellipsoids.")]
+    words = "The ellipsoids fitted to parts of the volume, in the colours of the bodies that they were joined to."
+    image = sheets.geometry_sheet(results, stage, frames, sheets.ellipsoid_meshes)
+    blocks = desk.sheet("ellipsoids", image, f"{e.centers.shape[1]} ellipsoids", words)
+    if len(e.centers) < 2:
+        return [*blocks, missing("One frame has no paths, so nothing tells the bodies apart.")]
+    words = "Each ellipsoid's way through all frames. Paths of one body run side by side; a path that jumps was lost."
+    blocks += desk.sheet("paths", sheets.path_sheet(results, stage, frames[0]), "Paths", words)
+    paths = relative_paths(e, results.diagnostics)
+    words = (
+        "A relative path is a path minus its mean. Ellipsoids of one body move alike: their curves lie together, and "
+        "their distance curves to each other stay low."
+    )
+    curves = figures.path_curves(paths, e.body, results.up, results.fps)
+    blocks += desk.plot("path_curves", curves, "Relative paths and distance curves", words)
+    words = (
+        "The mean of a distance curve over time decides whether two ellipsoids belong together. A gap in the sorted "
+        "integrals is a clear decision; a smooth slope is not."
+    )
+    blocks += desk.plot("integrals", figures.integrals(paths, e.body), "Integrals", words)
+    if e.counts is not None or e.errors is not None:
+        words = "Steps and spikes show where the matching in time had to split or merge ellipsoids."
+        blocks += desk.plot("ellipsoid_curves", figures.ellipsoid_errors(e), "Sizes and fitting errors", words)
+    return blocks
+
+
+def _bodies(results: Results, stage: Stage | None, frames: list[int], desk: Desk) -> list[Block]:
+    if stage is None or "bodies" not in results.kinds:
+        return [missing("The run has no rigid bodies.")]
+    words = "Each body in its colour, grey what belongs to none. Borders should lie where the subject bends."
+    image = sheets.geometry_sheet(results, stage, frames, sheets.body_meshes)
+    blocks = desk.sheet("bodies", image, "Rigid bodies", words)
+    words = "The bodies over the images of all cameras. Where their border leaves the subject's, the volume is wrong."
+    middle = [frames[len(frames) // 2]]
+    if _calibrated(results):
+        over = sheets.overlay_sheet(results, middle, sheets.body_meshes, 0.72)
+        blocks += desk.sheet("bodies_overlay", over, f"Bodies over frame {middle[0]}", words)
+    return [*blocks, bodies_table(results, middle[0])]
+
+
+def _skeleton(results: Results, stage: Stage | None, quality: Quality, frames: list[int], desk: Desk) -> list[Block]:
+    if stage is None or results.skeleton is None:
+        return [missing("The run has no skeleton.")]
+    words = (
+        "The skeleton inside the translucent volume. Joints should sit where limbs bend, in the middle of the flesh."
+    )
+    image = sheets.geometry_sheet(results, stage, frames, sheets.skeleton_meshes)
+    blocks = desk.sheet("skeleton", image, "Skeleton", words)
+    if _calibrated(results):
+        middle = [frames[len(frames) // 2]]
+        words = "Bones and joints over the images of all cameras, the volume as glass around them."
+        over = sheets.overlay_sheet(results, middle, sheets.skeleton_meshes, 1.0)
+        blocks += desk.sheet("skeleton_overlay", over, f"Skeleton over frame {middle[0]}", words)
+    if len(results.skeleton.joint_positions) > 1:
+        words = (
+            "How far each joint has turned since the first frame, in its body's colour; thin lines: the rotation "
+            "vector's parts about the parent's axes. Smooth curves are good."
+        )
+        blocks += desk.plot("joint_angles", figures.joint_angles(results.skeleton, results.fps), "Joint angles", words)
+        if quality.bones:
+            words = "Bones don't grow: what differs from zero is error of the joints."
+            lengths = figures.bone_lengths(quality.bones, results.fps)
+            blocks += desk.plot("bone_lengths", lengths, "Bone lengths", words)
+    return blocks
+
+
+def _times(results: Results, desk: Desk) -> list[Block]:
+    stages = results.run.read_timings()
+    if not stages:
+        return [missing("The run has no timings.")]
+    words = "Wall-clock seconds of each stage, as measured in this run."
+    return [*desk.plot("timings", figures.timings(stages), "Timings", words), timings_table(stages)]
+
+
+def _calibrated(results: Results) -> bool:
+    return results.capture is not None and results.capture.is_calibrated

@@ -1,0 +1,210 @@
+"""Words and tables of the report."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from viz.palette import body_color, hex_color
+from viz.quality import Quality
+from viz.report import Block, Section, missing, table, text
+from viz.results import Results
+
+
+def section(title: str, blocks: list[Block]) -> Section:
+    """Return a section whose anchor follows from its title."""
+    return Section(title, title.lower().replace(" ", "-"), tuple(blocks))
+
+
+def title(results: Results) -> str:
+    """Return the report's title: the capture's name, or the run folder's."""
+    return results.capture.info.name if results.capture is not None else results.run.path.resolve().name
+
+
+def lead(results: Results) -> str:
+    """Return the sentence below the title."""
+    if results.capture is not None:
+        count = len(results.capture.cameras)
+        source = f"{count} camera{'s' if count != 1 else ''}"
+    else:
+        source = "a sequence of geometry" if len(results.frames) > 1 else "a scan"
+    e, s = results.ellipsoids, results.skeleton
+    if s is not None:
+        return f"From {source} to {s.n_bodies} rigid bodies and {len(s.joint_names)} joints, without a body model."
+    if e is not None and e.n_bodies:
+        return f"From {source} to {e.n_bodies} rigid bodies, without a body model."
+    if e is not None:
+        return f"From {source} to {e.centers.shape[1]} ellipsoids."
+    return f"What has been made from {source} so far."
+
+
+def key_figures(results: Results) -> tuple[tuple[str, str], ...]:
+    """Return the figures at the head of the report: (value, label)."""
+    figures = []
+    if results.capture is not None:
+        figures.append((str(len(results.capture.cameras)), "cameras"))
+    figures.append((str(len(results.frames)), "frames"))
+    if results.fps:
+        figures.append((f"{results.fps:g}", "frames per second"))
+        figures.append((f"{len(results.frames) / results.fps:.1f} s", "recorded"))
+    for kind in ("voxels", "cloud"):
+        if kind in results.counts:
+            label = "surface voxels a frame" if kind == "voxels" else "points a frame"
+            figures.append((f"{round(float(results.counts[kind].mean())):,}", label))
+    if results.ellipsoids is not None:
+        figures.append((str(results.ellipsoids.centers.shape[1]), "ellipsoids"))
+        if results.ellipsoids.n_bodies:
+            figures.append((str(results.ellipsoids.n_bodies), "bodies"))
+    if results.skeleton is not None:
+        figures.append((str(len(results.skeleton.joint_names)), "joints"))
+    timings = results.run.read_timings()
+    if timings:
+        figures.append((f"{sum(float(t['seconds']) for t in timings.values()):.1f} s", "of work"))
+    return tuple(figures)
+
+
+def cameras_table(results: Results) -> Block:
+    """Return the table of cameras: sizes, and interior and exterior orientation if the capture is calibrated."""
+    capture = results.capture
+    assert capture is not None
+    rows: list[tuple[str, ...]] = []
+    if not capture.is_calibrated:
+        for name in capture.cameras:
+            height, width = capture.frame(name, 0).shape[:2]
+            rows.append((name, f"{width} × {height}", "not calibrated"))
+        return table(("camera", "size (px)", ""), rows)
+    rig = capture.rig
+    for name, camera, center, (w, h) in zip(rig.names, rig.cameras, rig.centers, rig.sizes, strict=True):
+        opening = 2 * np.degrees(np.arctan(w / 2 / camera.focal_length_x))
+        x, y, z = center
+        place = f"{x:.2f}, {y:.2f}, {z:.2f}"
+        rows.append((name, f"{w} × {h}", f"{camera.focal_length_x:.1f}", f"{opening:.0f}", camera.model.name, place))
+    head = ("camera", "size (px)", "camera constant (px)", "opening (°)", "model", "position x, y, z (m)")
+    return table(head, rows, (2, 3))
+
+
+def bodies_table(results: Results, frame: int) -> Block:
+    """Return the table of bodies: their share of the points, ellipsoids and joints."""
+    labels = np.asarray(results.bodies(frame).bodies)
+    e, s = results.ellipsoids, results.skeleton
+    count = int(max(labels.max(initial=-1), -1 if e is None else e.body.max(initial=-1))) + 1
+    rows, colors = [], []
+    for body in (*range(count), *([-1] if (labels < 0).any() else [])):
+        share = f"{100 * float(np.mean(labels == body)):.1f}"
+        own = "" if e is None else str(int((e.body == body).sum()))
+        joints = ""
+        if s is not None and body >= 0:
+            joints = ", ".join(s.joint_names[j] for j in np.flatnonzero((s.joint_bodies == body).any(axis=1)).tolist())
+        rows.append((f"body {body}" if body >= 0 else "none", share, own, joints))
+        colors.append(hex_color(body_color(body)))
+    return table(("body", f"points in frame {frame} (%)", "ellipsoids", "joints"), rows, (1, 2), colors)
+
+
+def summary(quality: Quality) -> list[Block]:
+    """Return the sentence at the beginning that points to the warnings, if there are any."""
+    count = len(quality.warnings)
+    if count == 0:
+        return []
+    remarks = "One remark" if count == 1 else f"{count} remarks"
+    return [text(f"{remarks} on the quality of this run: see the section Quality before you use it.")]
+
+
+def figures_of_quality(results: Results, quality: Quality) -> list[Block]:
+    """Return warnings in words and the tables of what can be judged without ground truth."""
+    blocks: list[Block] = []
+    rows: list[tuple[str, ...]]
+    head: tuple[str, ...]
+    if quality.warnings:
+        blocks.append(Block("warnings", items=tuple(quality.warnings)))
+    else:
+        blocks.append(Block("fine", "Nothing conspicuous was found in what can be judged without ground truth."))
+    if quality.coverage is not None:
+        rows = []
+        for camera, share, cut in zip(
+            quality.coverage.cameras, quality.coverage.share, quality.coverage.cut, strict=True
+        ):
+            covered, inside = quality.agreement.get(camera, (np.nan, np.nan))
+            spread = f"{100 * np.nanmin(share):.1f} – {100 * np.nanmax(share):.1f}"
+            rows.append(
+                (
+                    camera,
+                    f"{100 * np.nanmedian(share):.1f}",
+                    spread,
+                    str(int(cut.sum())),
+                    _percent(covered),
+                    _percent(inside),
+                )
+            )
+        head = (
+            "camera",
+            "silhouette, median (%)",
+            "range (%)",
+            "frames cut by the border",
+            "of it covered by the volume (%)",
+            "of the volume inside it (%)",
+        )
+        blocks += [Block("heading", "Silhouettes"), table(head, rows, (1, 2, 3, 4, 5))]
+        if quality.agreement:
+            blocks.append(
+                text(
+                    "A visual hull covers nearly all of every silhouette. What it lacks, another camera's silhouette "
+                    "or a wrong calibration has cut away. It sticks out by about half a voxel and a pixel, which "
+                    "weighs more the thinner the subject."
+                )
+            )
+    if quality.bones:
+        rows = [
+            (b.name, f"{1000 * b.mean:.0f}", f"{1000 * b.spread:.1f}", f"{100 * b.spread / b.mean:.1f}")
+            for b in quality.bones
+            if b.mean > 0
+        ]
+        colors = [hex_color(body_color(b.body)) for b in quality.bones if b.mean > 0]
+        head = ("bone", "length (mm)", "varies by (mm)", "(%)")
+        blocks += [Block("heading", "Bone lengths"), table(head, rows, (1, 2, 3), colors)]
+    if results.skeleton is not None and quality.jitter is not None and np.isfinite(quality.jitter).any():
+        rows = [
+            (name, f"{1000 * j:.1f}")
+            for name, j in zip(results.skeleton.joint_names, quality.jitter, strict=True)
+            if np.isfinite(j)
+        ]
+        colors = [hex_color(body_color(int(b))) for b in results.skeleton.joint_bodies[:, 1]]
+        head = ("joint", "unrest: median second difference (mm)")
+        blocks += [Block("heading", "Unrest of the joints"), table(head, rows, (1,), colors)]
+    if quality.unassigned is not None:
+        blocks.append(text(f"{100 * quality.unassigned:.1f} % of the points belong to no body."))
+    return blocks
+
+
+def _percent(value: float) -> str:
+    return f"{100 * value:.1f}" if np.isfinite(value) else "–"
+
+
+def timings_table(stages: dict[str, dict[str, float]]) -> Block:
+    """Return the table of `timings.json`."""
+    rows = []
+    for name, values in stages.items():
+        rate = float(values.get("items_per_second", 0.0))
+        rows.append((name, f"{float(values['seconds']):.2f}", f"{int(values.get('items', 0)):,}", f"{rate:,.2f}"))
+    total = sum(float(v["seconds"]) for v in stages.values())
+    return table(("stage", "seconds", "items", "items a second"), [*rows, ("all", f"{total:.2f}", "", "")], (1, 2, 3))
+
+
+def record_blocks(results: Results) -> list[Block]:
+    """Return what `run.toml` says: source, versions, and all settings."""
+    record = results.record
+    if not record:
+        return [missing("The run has no run.toml.")]
+    blocks = []
+    for key in ("geomocap", "source", "versions"):
+        rows = [(name, _words(value)) for name, value in record.get(key, {}).items()]
+        if rows:
+            heading = {"geomocap": "Program", "source": "Source", "versions": "Versions"}[key]
+            blocks += [Block("heading", heading), table(("key", "value"), rows)]
+    blocks.append(Block("code", tomli_w.dumps(record), "The whole run.toml: enough to repeat the run"))
+    return blocks
+
+
+def _words(value: Any) -> str:
+    return ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else str(value)
