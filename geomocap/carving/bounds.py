@@ -8,12 +8,12 @@ kept are halved until the subject is resolved.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from geomocap.carving.block_kernels import possible, summed
 from geomocap.carving.grid import Grid
-from geomocap.carving.hull import BACKGROUND, UNSEEN, classify, rounding_bounds, summed
+from geomocap.carving.hull import rounding_bounds
 from geomocap.carving.settings import HullSettings
 from geomocap.carving.views import PinholeViews
 from geomocap.errors import GeometryError
@@ -88,7 +88,7 @@ def halve(
     children = (2 * cells[:, None] + parts).reshape(-1, 3)
     high = origin + (children.max(axis=0) + 1) * (edge / 2)
     space = Grid(origin, float((high - origin).max()), (1, 1, 1))
-    possible = _possible(
+    keep = possible(
         views.projections,
         rounding_bounds(views, space),
         *tables,
@@ -99,27 +99,7 @@ def halve(
         edge / 2,
         children,
     )
-    return children[possible]
-
-
-@njit(cache=True, nogil=True)
-def _possible(P, size, subject, seen, unseen, tolerance, min_views, origin, edge, cells):
-    """Mark the cells that may hold a point of the hull: every camera either may, or can't tell."""
-    half = 0.5 * edge
-    possible = np.zeros(len(cells), np.bool_)
-    for n in range(len(cells)):
-        x = origin[0] + (cells[n, 0] + 0.5) * edge
-        y = origin[1] + (cells[n, 1] + 0.5) * edge
-        z = origin[2] + (cells[n, 2] + 0.5) * edge
-        against, views = 0, 0
-        for c in range(P.shape[0]):
-            answer = classify(P, size, subject, seen, unseen, c, x, y, z, half, half, half)
-            views += answer != UNSEEN
-            against += answer == BACKGROUND
-            if against > tolerance:
-                break
-        possible[n] = against <= tolerance and (not unseen or views >= min_views)
-    return possible
+    return children[keep]
 
 
 def _tables(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.ndarray]:

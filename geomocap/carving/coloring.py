@@ -29,7 +29,9 @@ def voxel_colors(
     positions = grid.centers(surface)
     _blend(seen.seen, seen.colors, positions, normals(occupancy, surface), centers, colors, has_color)
     if has_color.any() and not has_color.all():
-        nearest = cKDTree(positions[has_color], balanced_tree=False, compact_nodes=False).query(positions[~has_color])[1]
+        nearest = cKDTree(positions[has_color], balanced_tree=False, compact_nodes=False).query(positions[~has_color])[
+            1
+        ]
         colors[~has_color] = colors[has_color][nearest]
     return colors
 

@@ -69,8 +69,10 @@ def camera_gains(seen: Sightings, samples: int = 2000) -> np.ndarray:
     gains = np.ones((C, 3), np.float32)
     if len(several) < 50:
         return gains
-    colors = np.where(seen.seen[several, :, None] != 0, seen.colors[several], np.nan)
-    middle = np.nanmedian(colors, axis=1)
+    colors = np.where(seen.seen[several, :, None] != 0, seen.colors[several], np.inf)
+    ordered, count = np.sort(colors, axis=1), seen.seen[several].sum(axis=1, dtype=np.int64)
+    row = np.arange(len(several))
+    middle = (ordered[row, (count - 1) // 2] + ordered[row, count // 2]) / 2
     for c in range(C):
         usable = (seen.seen[several, c] != 0) & (colors[:, c].min(axis=1) > 16)
         if usable.sum() >= 50:

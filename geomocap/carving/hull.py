@@ -9,16 +9,13 @@ same everywhere in it. What is decided for a block is not asked again below it.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
+from geomocap.carving.block_kernels import carve, summed
 from geomocap.carving.grid import Grid
 from geomocap.carving.occupancy import Occupancy
 from geomocap.carving.settings import HullSettings
 from geomocap.carving.views import PinholeViews
 
-BLOCK = 32  # edge of the blocks that are handed to threads: one word of the occupancy, so that no two share any
-LEVELS = 5  # blocks of 32, 16, 8, 4 and 2 voxels
-BACKGROUND, SUBJECT, UNSEEN, MIXED = 0, 1, 2, 3
 _DEFAULT = HullSettings()
 
 
@@ -37,7 +34,7 @@ def hull(views: PinholeViews, grid: Grid, settings: HullSettings = _DEFAULT) -> 
     occupancy = Occupancy.empty(grid.shape)
     subject = summed(views.masks)
     seen = summed(views.valid) if unseen else subject
-    _carve(
+    carve(
         views.projections,
         rounding_bounds(views, grid),
         views.masks,
@@ -87,179 +84,3 @@ def rounding_bounds(views: PinholeViews, grid: Grid) -> np.ndarray:
     far = np.append(np.maximum(np.abs(grid.low), np.abs(grid.high)), 1.0)
     sums = np.abs(views.projections) @ far
     return np.column_stack([sums[:, :2].max(axis=1), sums[:, 2]])
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def summed(masks):
-    """Summed-area tables (C, H + 1, W + 1) int32 of masks (C, H, W) of 0 and 1."""
-    C, H, W = masks.shape
-    out = np.empty((C, H + 1, W + 1), np.int32)
-    for c in prange(C):
-        out[c, 0, :] = 0
-        for v in range(H):
-            total = np.int32(0)
-            out[c, v + 1, 0] = 0
-            for u in range(W):
-                total += np.int32(masks[c, v, u])
-                out[c, v + 1, u + 1] = total
-            for u in range(1, W + 1):
-                out[c, v + 1, u] += out[c, v, u]
-    return out
-
-
-@njit(cache=True, nogil=True, inline="always")
-def classify(P, size, subject, seen, unseen, c, x, y, z, dx, dy, dz):
-    """Say what camera c says of all points within ±(dx, dy, dz) of (x, y, z), or MIXED if it can't be told.
-
-    For the point X0 in the middle, n(X) − u0 w(X) is linear and 0 at X0, so |u(X) − u0| is at most its largest value
-    in the box over the smallest depth there. `size` (C, 2) bounds the sums in numerators and depth: rounding errors
-    scale with it.
-    """
-    H, W = subject.shape[1] - 1, subject.shape[2] - 1
-    outside = UNSEEN if unseen else BACKGROUND
-    w = P[c, 2, 0] * x + P[c, 2, 1] * y + P[c, 2, 2] * z + P[c, 2, 3]
-    reach = dx * abs(P[c, 2, 0]) + dy * abs(P[c, 2, 1]) + dz * abs(P[c, 2, 2])
-    error = 1e-14 * size[c, 1]
-    if w + reach < -error:
-        return outside  # behind the camera
-    near = w - reach
-    if near <= 1e6 * error:
-        return MIXED
-    u = (P[c, 0, 0] * x + P[c, 0, 1] * y + P[c, 0, 2] * z + P[c, 0, 3]) / w
-    v = (P[c, 1, 0] * x + P[c, 1, 1] * y + P[c, 1, 2] * z + P[c, 1, 3]) / w
-    inverse = 1.0 / near
-    du = dx * abs(P[c, 0, 0] - u * P[c, 2, 0]) + dy * abs(P[c, 0, 1] - u * P[c, 2, 1])
-    du = (du + dz * abs(P[c, 0, 2] - u * P[c, 2, 2])) * inverse
-    dv = dx * abs(P[c, 1, 0] - v * P[c, 2, 0]) + dy * abs(P[c, 1, 1] - v * P[c, 2, 1])
-    dv = (dv + dz * abs(P[c, 1, 2] - v * P[c, 2, 2])) * inverse
-    du += 1e-6 + (1e-14 * size[c, 0] + error * (abs(u) + du)) * inverse
-    dv += 1e-6 + (1e-14 * size[c, 0] + error * (abs(v) + dv)) * inverse
-    left, right, top, bottom = u - du, u + du, v - dv, v + dv
-    if right < 0.0 or bottom < 0.0 or left >= W or top >= H:
-        return outside
-    inside = left >= 0.0 and top >= 0.0 and right < W and bottom < H
-    u0, v0 = int(max(left, 0.0)), int(max(top, 0.0))
-    u1, v1 = int(min(right, W - 1.0)) + 1, int(min(bottom, H - 1.0)) + 1
-    area = (u1 - u0) * (v1 - v0)
-    filled = subject[c, v1, u1] - subject[c, v0, u1] - subject[c, v1, u0] + subject[c, v0, u0]
-    if inside and filled == area:
-        return SUBJECT
-    if filled > 0:
-        return MIXED
-    if not unseen:
-        return BACKGROUND
-    visible = seen[c, v1, u1] - seen[c, v0, u1] - seen[c, v1, u0] + seen[c, v0, u0]
-    if visible == 0:
-        return UNSEEN
-    return BACKGROUND if inside and visible == area else MIXED
-
-
-@njit(cache=True, nogil=True)
-def _fill(bits, i0, i1, j0, j1, k0, k1):
-    """Set the bits of a box that lies within one word along z."""
-    word = np.uint32(((1 << (k1 - k0)) - 1) << (k0 & 31))
-    for i in range(i0, i1):
-        for j in range(j0, j1):
-            bits[i, j, k0 >> 5] |= word
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _carve(P, size, masks, valid, subject, seen, unseen, tolerance, min_views, origin, edge, Z, bits):
-    """Carve all blocks, one a task, each depth first.
-
-    A node of the stack is (x, y, z index of its corner, level, cameras undecided about its parent, subject votes,
-    background votes); `cameras[level]` lists the undecided ones for all children of one parent, which follow each
-    other on the stack.
-    """
-    C = P.shape[0]
-    H, W = masks.shape[1], masks.shape[2]
-    X, Y, nz = bits.shape
-    nx, ny = (X + BLOCK - 1) // BLOCK, (Y + BLOCK - 1) // BLOCK
-    for b in prange(nx * ny * nz):
-        cameras = np.empty((LEVELS + 1, C), np.int64)
-        stack = np.empty((7 * LEVELS + 1, 7), np.int64)
-        for c in range(C):
-            cameras[0, c] = c
-        stack[0, 0] = b // (ny * nz) * BLOCK
-        stack[0, 1] = b // nz % ny * BLOCK
-        stack[0, 2] = b % nz * BLOCK
-        stack[0, 3] = 0
-        stack[0, 4] = C
-        stack[0, 5] = 0
-        stack[0, 6] = 0
-        top = 1
-        while top > 0:
-            top -= 1
-            i0, j0, k0, level = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
-            n, n_subject, n_background = stack[top, 4], stack[top, 5], stack[top, 6]
-            step = BLOCK >> level
-            i1, j1, k1 = min(i0 + step, X), min(j0 + step, Y), min(k0 + step, Z)
-            # what do the undecided cameras say of the whole block?
-            x = origin[0] + (i0 + i1) * 0.5 * edge
-            y = origin[1] + (j0 + j1) * 0.5 * edge
-            z = origin[2] + (k0 + k1) * 0.5 * edge
-            dx, dy, dz = (i1 - i0 - 1) * 0.5 * edge, (j1 - j0 - 1) * 0.5 * edge, (k1 - k0 - 1) * 0.5 * edge
-            mixed = 0
-            for q in range(n):
-                c = cameras[level, q]
-                answer = classify(P, size, subject, seen, unseen, c, x, y, z, dx, dy, dz)
-                if answer == MIXED:
-                    cameras[level + 1, mixed] = c
-                    mixed += 1
-                elif answer == SUBJECT:
-                    n_subject += 1
-                elif answer == BACKGROUND:
-                    n_background += 1
-                    if n_background > tolerance:
-                        break
-            views = n_subject + n_background
-            if n_background > tolerance or (unseen and views + mixed < min_views):
-                continue
-            if n_background + mixed <= tolerance and (not unseen or views >= min_views):
-                word = np.uint32(((1 << (k1 - k0)) - 1) << (k0 & 31))
-                for i in range(i0, i1):
-                    for j in range(j0, j1):
-                        bits[i, j, k0 >> 5] |= word
-                continue
-            if step > 2:
-                step //= 2
-                for part in range(8):
-                    i, j, k = i0 + step * (part & 1), j0 + step * ((part >> 1) & 1), k0 + step * (part >> 2)
-                    if i < i1 and j < j1 and k < k1:
-                        stack[top, 0] = i
-                        stack[top, 1] = j
-                        stack[top, 2] = k
-                        stack[top, 3] = level + 1
-                        stack[top, 4] = mixed
-                        stack[top, 5] = n_subject
-                        stack[top, 6] = n_background
-                        top += 1
-                continue
-            # too small to divide: every voxel by itself, in the cameras that are undecided
-            for i in range(i0, i1):
-                x = origin[0] + (i + 0.5) * edge
-                for j in range(j0, j1):
-                    y = origin[1] + (j + 0.5) * edge
-                    for k in range(k0, k1):
-                        z = origin[2] + (k + 0.5) * edge
-                        against, views = n_background, n_subject + n_background
-                        for q in range(mixed):
-                            c = cameras[level + 1, q]
-                            w = P[c, 2, 0] * x + P[c, 2, 1] * y + P[c, 2, 2] * z + P[c, 2, 3]
-                            u = v = -1.0
-                            if w > 0.0:
-                                u = (P[c, 0, 0] * x + P[c, 0, 1] * y + P[c, 0, 2] * z + P[c, 0, 3]) / w
-                                v = (P[c, 1, 0] * x + P[c, 1, 1] * y + P[c, 1, 2] * z + P[c, 1, 3]) / w
-                            if not (u >= 0.0 and v >= 0.0 and u < W and v < H):
-                                against += not unseen
-                            elif masks[c, int(v), int(u)]:
-                                views += 1
-                            elif not unseen:
-                                against += 1
-                            elif valid[c, int(v), int(u)]:
-                                against += 1
-                                views += 1
-                            if against > tolerance:
-                                break
-                        if against <= tolerance and (not unseen or views >= min_views):
-                            bits[i, j, k >> 5] |= np.uint32(1 << (k & 31))

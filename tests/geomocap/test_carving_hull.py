@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import binary_erosion
 
+from geomocap.carving.block_kernels import summed
 from geomocap.carving.grid import Grid
-from geomocap.carving.hull import _integral, hull_surface, visual_hull
+from geomocap.carving.hull import hull_surface, visual_hull
 from geomocap.carving.occupancy import Occupancy
 from geomocap.carving.reference import visual_hull_brute, visual_hull_numpy
 from geomocap.carving.settings import HullSettings
@@ -128,7 +129,7 @@ def test_surface_is_what_erosion_takes_away():
 
 def test_integral_images():
     masks = (np.random.default_rng(0).random((3, 11, 17)) < 0.4).astype(np.uint8)
-    table = _integral(masks)
+    table = summed(masks)
     assert not table[:, 0].any() and not table[:, :, 0].any()
     np.testing.assert_array_equal(table[:, 1:, 1:], masks.astype(int).cumsum(1).cumsum(2))
 

@@ -1,0 +1,164 @@
+"""The working volume, and the lines that say why there is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from geomocap.carving.agreement import (
+    check_agreement,
+    check_cameras,
+    check_inside,
+    check_silhouettes,
+    silhouette_coverage,
+)
+from geomocap.carving.bounds import subject_box
+from geomocap.carving.frames import carve_frame
+from geomocap.carving.grid import Grid
+from geomocap.carving.hull import hull_surface, visual_hull
+from geomocap.carving.settings import CarvingSettings, HullSettings
+from geomocap.carving.views import PinholeViews
+from geomocap.carving.volume import working_volume
+from geomocap.errors import CalibrationError, GeometryError
+from tests.geomocap.carving_scenes import FIGURE, look_at, ring, silhouettes
+
+LOW = (FIGURE[:, :3] - FIGURE[:, 3:]).min(axis=0)
+HIGH = (FIGURE[:, :3] + FIGURE[:, 3:]).max(axis=0)
+
+
+def figure(P: np.ndarray, **size: int) -> PinholeViews:
+    return PinholeViews.of(P, silhouettes(P, FIGURE, **size), names=[f"cam{c}" for c in range(len(P))])
+
+
+@pytest.mark.parametrize(
+    ("P", "slack"),
+    [
+        (ring(8), 0.06),
+        (ring(3), 0.12),
+        (ring(8, radius=25, focal=400), 0.12),  # a subject of 29 pixels
+        (ring(6, radius=60, focal=4000), 0.12),  # seen from far away
+    ],
+    ids=["ring", "three", "small", "far"],
+)
+def test_box_is_the_subject_s(P, slack):
+    low, high = subject_box(figure(P), HullSettings())
+    # pixels are decided by their centres: half of one may be missing
+    assert (low <= LOW + 0.035).all() and (high >= HIGH - 0.035).all()
+    assert (low >= LOW - slack).all() and (high <= HIGH + slack).all()
+
+
+def test_cameras_on_an_arc_get_the_whole_hull():
+    views = figure(ring(4, arc_deg=40))
+    grid = working_volume([views])
+    check_inside(hull_surface(views, grid), grid, 0)
+    assert (grid.low <= LOW).all() and (grid.high >= HIGH).all()
+    # along the line of sight the hull is longer than the subject: nobody looks from the side
+    assert 1.2 < np.ptp(grid.centers(hull_surface(views, grid))[:, 0]) < 2.0
+
+
+def test_volume_holds_all_frames_and_nothing_depends_on_false_blobs():
+    P = ring(8)
+    frames = []
+    for shift in (-0.3, 0.0, 0.4):
+        moved = FIGURE + np.array([shift, 0, 0, 0, 0, 0])
+        masks = silhouettes(P, moved)
+        for c, mask in enumerate(masks):
+            mask[(17 * c) % 200 : (17 * c) % 200 + 12, 5 + 30 * c : 20 + 30 * c] = 1
+        frames.append(PinholeViews.of(P, masks))
+    # one blob that all cameras agree on, far from the subject
+    ball = silhouettes(P, np.array([[-0.9, 0.9, 0.1, 0.04, 0.04, 0.04]]))
+    frames[1] = PinholeViews.of(P, [m | b for m, b in zip(silhouettes(P, FIGURE), ball, strict=True)])
+    grid = working_volume(frames, CarvingSettings(margin=0, resolution=128))
+    assert max(grid.shape) == 128
+    np.testing.assert_allclose(grid.low, LOW - np.array([0.3, 0, 0]), atol=0.07)
+    np.testing.assert_allclose(grid.high, HIGH + np.array([0.4, 0, 0]), atol=0.07)
+
+
+def test_settings_decide_before_anything_is_measured():
+    given = CarvingSettings(volume=((-1, -1, 0), (1, 1, 2)), voxel_size=0.05)
+    grid = working_volume([], given)
+    assert grid.shape == (40, 40, 40) and grid.voxel_size == 0.05
+    with pytest.raises(GeometryError, match="no frames"):
+        working_volume([])
+
+
+def test_volume_of_what_not_all_cameras_see():
+    P = ring(5)
+    masks = silhouettes(P, FIGURE)
+    seen = [np.ones_like(m) for m in masks]
+    seen[0][:, :170] = 0
+    views = PinholeViews.of(P, masks, seen)
+    low, high = subject_box(views, HullSettings(outside="unseen", min_views=4))
+    assert (low <= LOW + 0.02).all() and (high >= HIGH - 0.02).all()
+    assert np.linalg.norm(high - low) < 1.25 * np.linalg.norm(HIGH - LOW)
+
+
+@pytest.mark.parametrize("wrong", [0, 3])
+@pytest.mark.parametrize("aim", [[0, 2.0, 0.9], [0.35, 0.3, 0.9]], ids=["elsewhere", "beside"])
+def test_the_camera_that_contradicts_the_others_is_named(wrong, aim):
+    P = ring(8)
+    masks = silhouettes(P, FIGURE)
+    center = -np.linalg.solve(P[wrong, :, :3], P[wrong, :, 3])
+    P[wrong] = look_at(center, aim, 300, 320, 240)
+    views = PinholeViews.of(P, masks, names=[f"cam{c}" for c in range(8)])
+    with pytest.raises(GeometryError, match=f"frame 7: the silhouettes of camera cam{wrong} contradict the others"):
+        working_volume([views], numbers=[7])
+
+
+def test_two_cameras_that_disagree_are_both_named():
+    P = ring(2, arc_deg=90)
+    masks = silhouettes(P, FIGURE)
+    masks[0][70:] = 0  # the head in one camera, the feet in the other
+    masks[1][:170] = 0
+    with pytest.raises(GeometryError, match="silhouettes of cam0, cam1 have no common volume"):
+        working_volume([PinholeViews.of(P, masks, names=["cam0", "cam1"])])
+
+
+def test_agreeing_silhouettes_are_explained():
+    views = figure(ring(6))
+    assert (silhouette_coverage(views, HullSettings()) > 0.99).all()
+    check_agreement(views, 0, HullSettings())
+
+
+def test_a_camera_that_looks_away_is_named():
+    P = ring(6)
+    check_cameras(figure(P))
+    center = -np.linalg.solve(P[2, :, :3], P[2, :, 3])
+    P[2] = look_at(center, 2 * center, 300, 320, 240)
+    with pytest.raises(CalibrationError, match="camera cam2 looks away"):
+        check_cameras(PinholeViews.of(P, [np.ones((240, 320))] * 6, names=[f"cam{c}" for c in range(6)]))
+    P[4] = look_at(center, 2 * center, 300, 320, 240)
+    with pytest.raises(CalibrationError, match="no point is seen by all cameras"):
+        check_cameras(PinholeViews.of(P, [np.ones((240, 320))] * 6))
+
+
+def test_empty_silhouettes_are_named():
+    P = ring(4)
+    masks = silhouettes(P, FIGURE)
+    masks[1][:] = 0
+    views = PinholeViews.of(P, masks, names=["a", "b", "c", "d"])
+    with pytest.raises(GeometryError, match="frame 12: the silhouette of camera b is empty"):
+        check_silhouettes(views, 12)
+    check_silhouettes(views, 12, tolerance=1)
+    with pytest.raises(GeometryError, match="frame 3: the silhouette of camera b is empty"):
+        carve_frame(views, Grid.of_box(LOW, HIGH, resolution=32), frame=3)
+
+
+def test_views_from_one_side_only_bound_nothing():
+    with pytest.raises(GeometryError, match="don't bound the subject"):
+        working_volume([figure(ring(2, arc_deg=2))])
+
+
+def test_subject_outside_the_volume():
+    views = figure(ring(6))
+    with pytest.raises(GeometryError, match=r"frame 4: subject outside the volume .* no voxel is left"):
+        carve_frame(views, Grid.of_box([2, 2, 0], [3, 3, 1], resolution=32), frame=4)
+    cut = Grid.of_box(LOW - 0.1, [*(HIGH[:2] + 0.1), 1.2], resolution=64)
+    with pytest.raises(GeometryError, match=r"it is cut off at high z \(\d"):
+        carve_frame(views, cut, frame=4)
+    allowed = carve_frame(views, cut, CarvingSettings(max_cut=1.0))
+    assert len(allowed.indices) > 100
+    whole = Grid.of_box(LOW - 0.1, HIGH + 0.1, resolution=64)
+    voxels = carve_frame(views, whole)
+    np.testing.assert_array_equal(voxels.indices, hull_surface(views, whole))
+    assert visual_hull(views, whole)[tuple(voxels.indices.T)].all() and (voxels.colors == voxels.colors[0, 0]).all()
