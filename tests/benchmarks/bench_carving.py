@@ -1,0 +1,91 @@
+"""Space carving: 8 silhouettes of 320×240 of a figure made in code, 256³ voxels."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+
+from geomocap.carving.bounds import subject_box
+from geomocap.carving.frames import carve_frame
+from geomocap.carving.grid import Grid
+from geomocap.carving.hull import hull, hull_surface, visual_hull
+from geomocap.carving.reference import visual_hull_brute, visual_hull_numpy
+from geomocap.carving.settings import CarvingSettings, ConsistencySettings, HullSettings
+from geomocap.carving.views import PinholeViews
+from tests.benchmarks.table import Row, measure
+from tests.geomocap.carving_scenes import FIGURE, ring, silhouettes
+
+GRID = Grid(np.array([-1.0, -1.0, -0.1]), 2 / 256, (256, 256, 256))
+
+
+def carve_with_open3d(P: np.ndarray, masks: list[np.ndarray]) -> o3d.geometry.VoxelGrid:
+    """Carve with what Open3D has for it; it wants intrinsics and extrinsics apart."""
+    grid = o3d.geometry.VoxelGrid.create_dense(GRID.origin, [0.5, 0.5, 0.5], GRID.voxel_size, 2.0, 2.0, 2.0)
+    for camera, mask in zip(P, masks, strict=True):
+        K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+        parameters = o3d.camera.PinholeCameraParameters()
+        parameters.intrinsic = o3d.camera.PinholeCameraIntrinsic(320, 240, K)
+        parameters.extrinsic = np.vstack([np.linalg.solve(K, camera), [0, 0, 0, 1]])
+        grid.carve_silhouette(o3d.geometry.Image(mask.astype(np.float32)), parameters, False)
+    return grid
+
+
+def textured_images(views: PinholeViews) -> np.ndarray:
+    """Pictures with a fine pattern and noise: what colour consistency has to read."""
+    rng = np.random.default_rng(0)
+    C, H, W = views.masks.shape
+    y, x = np.mgrid[0:H, 0:W]
+    pattern = 128 + 60 * np.sin(x / 4) * np.cos(y / 5)
+    return np.clip(pattern[None, ..., None] + rng.normal(0, 4, (C, H, W, 3)), 0, 255).astype(np.uint8)
+
+
+def benchmark() -> list[Row]:
+    """Time the hull beside what else there is, then what goes beyond it."""
+    P = ring(8)
+    masks = silhouettes(P, FIGURE)
+    views = PinholeViews.of(P, masks)
+    full = PinholeViews.of(P, [np.ones_like(m) for m in masks])
+    images = textured_images(views)
+    out = np.zeros(GRID.shape, np.uint8)
+    brute = visual_hull_brute(views, GRID)
+    same = "identical" if np.array_equal(visual_hull(views, GRID), brute) else "DIFFERENT from brute force"
+    plain = CarvingSettings(consistency=ConsistencySettings(enabled=False))
+    consistent = CarvingSettings()
+
+    ours = measure(lambda: hull(PinholeViews.of(P, masks), GRID), 25)
+    brute_time = measure(lambda: visual_hull_brute(views, GRID), 7)
+    note = f"{same}; {int(brute.sum()):,} voxels, {len(hull_surface(views, GRID)):,} on the surface"
+    return [
+        Row("hull, 8 × 320×240, 256³", ours, "Numba brute force", brute_time, "≤ 6 ms, ≥ 10 ×", note),
+        Row(
+            "hull into an array of bytes",
+            measure(lambda: visual_hull(views, GRID, out=out), 25),
+            "Numba brute force",
+            brute_time,
+            "",
+            "16 MB written",
+        ),
+        Row(
+            "hull",
+            ours,
+            "Open3D create_dense + carve_silhouette",
+            measure(lambda: carve_with_open3d(P, masks), 1, warm_up=False),
+        ),
+        Row("hull", ours, "NumPy", measure(lambda: visual_hull_numpy(views, GRID), 1, warm_up=False)),
+        Row(
+            "hull, everything foreground",
+            measure(lambda: hull(full, GRID), 15),
+            "Numba brute force",
+            measure(lambda: visual_hull_brute(full, GRID), 3),
+        ),
+        Row("hull, outside unseen", measure(lambda: hull(views, GRID, HullSettings(outside="unseen")), 15)),
+        Row("surface voxels of the hull, sorted", measure(lambda: hull_surface(views, GRID), 25)),
+        Row("one frame, colours by visibility", measure(lambda: carve_frame(views, GRID, plain, images), 9)),
+        Row(
+            "one frame, colour consistency",
+            measure(lambda: carve_frame(views, GRID, consistent, images), 9),
+            goal="≤ 100 ms",
+            note=f"{consistent.consistency.max_passes} passes at most",
+        ),
+        Row("box round the subject", measure(lambda: subject_box(views, HullSettings()), 9)),
+    ]
