@@ -218,8 +218,8 @@ def _noise(
             x.append(np.median(g[inside]) ** 2)
             y.append((1.4826 * np.median(np.abs(r))) ** 2)
     a = max(float(np.median(y[: max(1, len(y) // 2)])), LEAST_NOISE**2)
-    slopes = [max(0.0, (v - a) / u) for u, v in zip(x, y, strict=True) if u > 1.0]
-    b = float(np.median(slopes)) if slopes else 0.0
+    steepest = [(max(0.0, v - a), u) for u, v in zip(x, y, strict=True) if u > 1.0][-4:]
+    b = sum(v for v, _ in steepest) / sum(u for _, u in steepest) if steepest else 0.0
     return np.sqrt(a + b * gradient**2).astype(np.float32)
 
 

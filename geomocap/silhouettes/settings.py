@@ -28,7 +28,7 @@ class SilhouetteSettings(Settings):
         default=True, description="Judge doubtful pixels by the colours that the subject has elsewhere."
     )
     shadow_darkest: float = Field(
-        default=0.4, gt=0, lt=1, description="Brightness left in the deepest shadow (ratio to the background)."
+        default=0.5, gt=0, lt=1, description="Brightness left in the deepest shadow (ratio to the background)."
     )
     shadow_lightest: float = Field(
         default=1.1, gt=1, lt=2, description="Brightness of the strongest reflection on the background (ratio)."
@@ -37,7 +37,7 @@ class SilhouetteSettings(Settings):
         default=2, ge=1, le=8, description="Half width of the window that compares texture (pixels)."
     )
     shadow_color: float = Field(
-        default=0.04,
+        default=0.03,
         gt=0,
         lt=1,
         description="How much a shadow may change colour, and brightness within the window (ratio).",
