@@ -1,0 +1,282 @@
+"""From approximate values to the final adjustment: labels, outliers, the camera model that the observations carry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geomocap.calibration.adjustment import OPENCV, Adjusted, Prior, adjust, interior_indices
+from geomocap.calibration.covariance import covariance
+from geomocap.calibration.eccentricity import ball_radius, observed_radii, shifts
+from geomocap.calibration.initial import network_of, weak_prior
+from geomocap.calibration.labelling import identify, observed
+from geomocap.calibration.network import Network
+from geomocap.calibration.projection import INTERIOR_NAMES
+from geomocap.calibration.settings import BarSettings
+from geomocap.calibration.sightings import Sightings
+from geomocap.calibration.stability import resect, split_view, sudden_loss, sudden_shift, test_split
+from geomocap.errors import CalibrationError
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Final adjustment and what was made of the sightings.
+
+    Attributes
+    ----------
+    adjusted : Adjusted
+    chosen : (C, T, 2) int
+        Candidate that is each end in each image, -1 where none was found.
+    rejected : (C, T, 2) bool
+        Candidates found to be an end, but left out as outliers.
+    view_of : (C, T) int
+        View of each camera in each frame.
+    target_radius : float
+        Radius of the balls for which image centres were corrected, metres; 0 without correction.
+    """
+
+    adjusted: Adjusted
+    chosen: np.ndarray
+    rejected: np.ndarray
+    view_of: np.ndarray
+    target_radius: float
+
+
+@dataclass(frozen=True)
+class Significance:
+    """Test of a parameter that the final model does not have, or of one that it has.
+
+    Attributes
+    ----------
+    camera, parameter : str
+    value, sigma : float
+    """
+
+    camera: str
+    parameter: str
+    value: float
+    sigma: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether it differs from zero by more than 3.3 standard deviations (0.1 % of chance)."""
+        return abs(self.value) > 3.3 * self.sigma
+
+
+def poses_of(network: Network) -> np.ndarray:
+    """Poses of the views, (V, 3, 4) float."""
+    return np.concatenate([network.rotation, network.translation[:, :, None]], axis=2)
+
+
+def scale_of(network: Network, residuals: np.ndarray) -> float:
+    """Robust factor between actual and a-priori standard deviations of image coordinates."""
+    return float(1.4826 * np.median(np.abs(residuals / network.sigmas[:, None])))
+
+
+def estimate(
+    sightings: Sightings,
+    begin: Adjusted,
+    length: float,
+    settings: BarSettings,
+    prior: Prior,
+    free: tuple[int, ...],
+    length_sigma: float | None = None,
+    target_radius: float | None = None,
+) -> Estimate:
+    """Go from approximate values to the final adjustment.
+
+    Rounds of labelling with all cameras and robust adjustment, each with a tighter limit, that also look for cameras
+    that were moved; then least squares without outliers, repeated until the set of outliers stays.
+
+    Parameters
+    ----------
+    length, length_sigma : float
+        Of the bar, metres.
+    prior : Prior
+    free : tuple of int
+        Interior parameters to estimate.
+    target_radius : float, optional
+        Of the balls, metres; estimated if not given. Only for spheres.
+    """
+    length_sigma = length_sigma or settings.length_sigma
+    rough = adjust(begin.network, free, prior, loss=2.0, max_iterations=40, tolerance=1e-5)
+    side = sightings.sizes.max(axis=1).astype(float)
+    C, T = sightings.pixels.shape[:2]
+    view_of = np.tile(np.arange(C)[:, None], (1, T))
+    for share in (0.015, 0.006, 0.004):
+        spread = 1.4826 * float(np.median(np.abs(rough.residuals)))
+        limit = np.minimum(np.maximum(8 * spread, 1.0), share * side)
+        chosen = identify(sightings, rough.network.interior, poses_of(rough.network), length, limit, view_of=view_of)
+        rough = _relabelled(sightings, chosen, rough, spread, free, prior, view_of)
+        change = sudden_loss(sightings, chosen, view_of)
+        if change is not None:
+            moved = _with_new_pose(sightings, chosen, rough, change, view_of, float(limit[change[0]]), settings.seed)
+            if moved is not None:
+                view_of, network = moved
+                rough = replace(rough, network=network)
+                chosen = identify(sightings, network.interior, poses_of(network), length, limit, view_of=view_of)
+                rough = _relabelled(sightings, chosen, rough, spread, free, prior, view_of)
+        change = sudden_shift(rough, view_of, sightings.frames)
+        if change is not None:
+            split = test_split(rough, view_of, sightings.frames, change, prior, loss=2.0)
+            if split is not None:
+                rough, view_of = split
+    chosen = identify(sightings, rough.network.interior, poses_of(rough.network), length, limit, view_of=view_of)
+    network = _network(sightings, chosen, rough.network, 0.0, length_sigma, view_of)
+    final = clean(network, free, prior, settings)
+    radius = 0.0
+    radii = observed_radii(final.network, sightings, chosen)
+    if settings.targets.shape == "sphere" and np.all(radii > 0):
+        radius = target_radius or ball_radius(final.network, radii)
+        # Once more with the images of the balls' centres instead of the centres of their images
+        n = network.with_state(final.network.interior, final.network.rotation, final.network.translation, network.bars)
+        n = _network(sightings, chosen, n, 0.0, length_sigma, view_of)
+        n = replace(n, pixels=n.pixels - shifts(n, radius))
+        final = clean(n, free, prior, settings)
+    kept = np.zeros(chosen.shape, dtype=bool)
+    n = final.network
+    kept[n.view_camera[n.view], _times(n, sightings), n.end] = True
+    return Estimate(final, chosen, (chosen >= 0) & ~kept, view_of, radius)
+
+
+def _network(
+    sightings: Sightings,
+    chosen: np.ndarray,
+    state: Network,
+    least_sigma: float,
+    length_sigma: float,
+    view_of: np.ndarray,
+) -> Network:
+    pixels, sigmas = observed(sightings, chosen)
+    sigmas = np.maximum(sigmas, least_sigma)
+    poses = poses_of(state)
+    return network_of(sightings, pixels, sigmas, state.interior, poses, state.length, length_sigma, view_of)
+
+
+def _relabelled(
+    sightings: Sightings,
+    chosen: np.ndarray,
+    rough: Adjusted,
+    spread: float,
+    free: tuple[int, ...],
+    prior: Prior,
+    view_of: np.ndarray,
+) -> Adjusted:
+    length_sigma = max(0.002 * rough.network.length, 1e-6)
+    network = _network(sightings, chosen, rough.network, 0.5 * spread, length_sigma, view_of)
+    return adjust(network, free, prior, loss=2.0, max_iterations=40, tolerance=1e-5)
+
+
+def _with_new_pose(
+    sightings: Sightings,
+    chosen: np.ndarray,
+    rough: Adjusted,
+    change: tuple[int, int],
+    view_of: np.ndarray,
+    limit: float,
+    seed: int,
+) -> tuple[np.ndarray, Network] | None:
+    """Give a camera that does not fit from (or up to) some frame a second pose, found from the others' bars."""
+    camera, start = change
+    before = (chosen[camera, :start] >= 0).any(axis=1).mean()
+    after = (chosen[camera, start:] >= 0).any(axis=1).mean()
+    T = len(sightings.frames)
+    lost = np.arange(start, T) if before > after else np.arange(start)
+    rng = np.random.default_rng((seed, camera, start))
+    pose = resect(rough.network, sightings, camera, lost, max(limit, 2.0), rng)
+    if pose is None:
+        return None
+    n = rough.network
+    split = split_view(view_of, camera, start, n.n_views)
+    rotation = np.concatenate([n.rotation, n.rotation[camera : camera + 1]])
+    translation = np.concatenate([n.translation, n.translation[camera : camera + 1]])
+    target = n.n_views if before > after else camera
+    rotation[target], translation[target] = pose[:, :3], pose[:, 3]
+    return split, replace(n, view_camera=np.r_[n.view_camera, camera], rotation=rotation, translation=translation)
+
+
+def clean(network: Network, free: tuple[int, ...], prior: Prior, settings: BarSettings) -> Adjusted:
+    """Adjust robustly, then by least squares without outliers until their set stays."""
+    everything = adjust(network, free, prior, loss=3.0, max_iterations=40, tolerance=1e-6)
+    network = everything.network
+    result = everything
+    for _ in range(5):
+        error = np.linalg.norm(result.residuals / network.sigmas[:, None], axis=1)
+        # Residuals are smaller than errors by the share of the observations that checks the others
+        share = np.sqrt((2 * len(network.bar) + len(network.bars)) / max(result.redundancy, 1))
+        scale = max(scale_of(network, result.residuals), 0.5) * max(0.9 * share, 1.0)
+        bad = error > settings.outlier_threshold * scale
+        lengths = np.linalg.norm(network.bars[:, 0] - network.bars[:, 1], axis=1) - network.length
+        bad |= (np.abs(lengths) > settings.outlier_threshold * scale * network.length_sigma)[network.bar]
+        if result is not everything and not bad.any():
+            break
+        if bad.mean() > 0.5:
+            raise CalibrationError(
+                "more than half of the observed targets contradict any calibration; check that the cameras are "
+                "synchronized, that they did not move, and that nothing else bright was recorded"
+            )
+        network = network.with_observations(~bad)
+        result = adjust(network, free, prior)
+        network = result.network
+    return result
+
+
+def _times(network: Network, sightings: Sightings) -> np.ndarray:
+    return np.searchsorted(sightings.frames, network.frames)[network.bar]
+
+
+def choose_model(estimate: Estimate, prior: Prior, settings: BarSettings) -> tuple[Adjusted, tuple[Significance, ...]]:
+    """Test the parameters beyond OPENCV, and take k3 into the model if the observations ask for it.
+
+    Shear (and k3 where it is not part of the model) is estimated in an extra adjustment and tested against its standard
+    deviation; COLMAP's models have no shear, so it is reported only.
+    """
+    adjusted = estimate.adjusted
+    free = adjusted.columns.free_interior
+    if not free:
+        return adjusted, ()
+    names = adjusted.network.names
+    loose = Prior(prior.mean, prior.sigma.copy(), prior.aspect_sigma)
+    extra = interior_indices(("k3", "shear")) if settings.model != "FULL_OPENCV" else interior_indices(("shear",))
+    wide = adjust(adjusted.network, tuple(sorted({*free, *extra})), loose)
+    tests = tests_of(wide, extra)
+    if settings.model == "auto":
+        with_k3 = adjust(adjusted.network, (*free, *interior_indices(("k3",))), loose)
+        gain = (adjusted.cost - with_k3.cost) / with_k3.sigma0**2
+        # Each camera's k3 must earn its place against the number of observations (Schwarz's criterion)
+        if gain > len(names) * np.log(2 * len(adjusted.network.bar)) and _effect(with_k3, adjusted) > 0.05:
+            adjusted = with_k3
+    return adjusted, tests
+
+
+def _effect(a: Adjusted, b: Adjusted) -> float:
+    """Root mean square difference of two adjustments' residuals, pixels."""
+    return float(np.sqrt(np.mean((a.residuals - b.residuals) ** 2)))
+
+
+def tests_of(adjusted: Adjusted, parameters: tuple[int, ...]) -> tuple[Significance, ...]:
+    """Return value and standard deviation of these interior parameters of every camera."""
+    C = covariance(adjusted).cameras
+    columns = adjusted.columns
+    out = []
+    for p in parameters:
+        k = columns.free_interior.index(p)
+        for c, name in enumerate(adjusted.network.names):
+            column = columns.interior(c)[k]
+            value = float(adjusted.network.interior[c, p])
+            out.append(Significance(name, INTERIOR_NAMES[p], value, float(np.sqrt(C[column, column]))))
+    return tuple(out)
+
+
+def prior_for(
+    sightings: Sightings, begin: Adjusted, given: np.ndarray | None, settings: BarSettings
+) -> tuple[Prior, tuple[int, ...]]:
+    """Prior and free parameters of the final model."""
+    if given is not None:
+        return Prior.none(len(sightings.cameras)), ()
+    prior = weak_prior(sightings.sizes, begin.network.interior[:, 0], settings)
+    free = OPENCV
+    if settings.model == "FULL_OPENCV":
+        free = interior_indices(INTERIOR_NAMES[:12])
+    return prior, free
