@@ -3,12 +3,14 @@
 Candidates for the time offset come from what no rigid motion changes: how spread out the points are and how fast they
 move. For each, and for the rotations that lay the principal axes of the two clouds of trajectories on each other,
 trajectories are matched and the rigid motion is fitted in turn, as iterative closest points (Besl & McKay 1992) do with
-points. The best is refined, offset and rigid motion together.
+points. Each is refined, offset and rigid motion together, and the best is taken. A motion that repeats itself fits at
+several offsets: among the equally good the smallest offset counts.
 """
 
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment, minimize_scalar
@@ -19,8 +21,11 @@ from geomocap.evaluation.settings import EvaluationSettings
 
 Pairs = list[tuple[int, int]]
 
-CANDIDATE_OFFSETS = 6
-ROUNDS = 30
+CANDIDATE_OFFSETS = 10
+ROUNDS, FEW_ROUNDS = 30, 8
+FEW_FRAMES = 24
+KEPT_STARTS = 2  # of the 24
+TIE, TIE_M = 0.2, 0.002  # fits that are worse by no more than this are as good as the best
 START_LIMIT, END_LIMIT = 0.5, 0.15  # shares of the extent within which trajectories match, narrowing
 FEWEST_FRAMES = 3
 
@@ -57,29 +62,60 @@ def align_trajectories(
     if not settings.align and not settings.find_offset:
         return still
     offsets = candidate_offsets(found, times, track, settings.max_offset) if settings.find_offset else [settings.offset]
-    best: tuple[float, Alignment, Pairs] | None = None
+    fits = []
     for offset in offsets:
-        other = track.at(times + offset)
-        for start in _starts(found, other) if settings.align else [still]:
-            fit = _match_and_fit(found, other, start, extent, settings.align, pairs)
-            if fit is not None and (best is None or fit[0] < best[0]):
-                best = (fit[0], Alignment(fit[1].rotation, fit[1].translation, offset), fit[2])
-    if best is None:
+        fit = _fit_at(offset, found, times, track, settings, extent, pairs)
+        if fit is not None:
+            fits.append(fit)
+    if not fits:
         raise EvaluationError(
             "no time offset and alignment was found at which run and truth match; name the pairs in a TOML (--matches) "
             "or state the offset (--offset)"
         )
-    _, alignment, matched = best
-    for _ in range(3):
+    good_enough = min(fit.cost for fit in fits) * (1 + TIE) + TIE_M
+    return min((fit for fit in fits if fit.cost <= good_enough), key=lambda f: abs(f.alignment.time_offset)).alignment
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """An alignment, the trajectories that it matches, and their mean distance, metres, capped for the unmatched."""
+
+    cost: float
+    alignment: Alignment
+    pairs: Pairs
+
+
+def _fit_at(
+    offset: float,
+    found: np.ndarray,
+    times: np.ndarray,
+    track: MarkerTrack,
+    settings: EvaluationSettings,
+    extent: float,
+    pairs: Pairs | None,
+) -> _Fit | None:
+    """Find the best alignment near a time offset: from all starts on a few frames, then from the best on all."""
+    other = track.at(times + offset)
+    starts = _starts(found, other) if settings.align else [Alignment(np.eye(3), np.zeros(3), offset)]
+    if len(starts) > 1:
+        few = np.unique(np.linspace(0, len(found) - 1, FEW_FRAMES).round().astype(int))
+        tried = [_match_and_fit(found[few], other[few], s, extent, True, pairs, rounds=FEW_ROUNDS) for s in starts]
+        ranked = sorted((fit for fit in tried if fit is not None), key=lambda fit: fit.cost)
+        starts = [fit.alignment for fit in ranked[:KEPT_STARTS]]
+    fits = [_match_and_fit(found, other, s, extent, settings.align, pairs) for s in starts]
+    fit = min((f for f in fits if f is not None), key=lambda f: f.cost, default=None)
+    if fit is None:
+        return None
+    alignment = replace(fit.alignment, time_offset=offset)
+    for _ in range(2):
         if settings.find_offset:
-            alignment = _refine_offset(found, times, track, alignment, matched, settings.align)
+            alignment = _refine_offset(found, times, track, alignment, fit.pairs, settings.align)
         other = track.at(times + alignment.time_offset)
-        fit = _match_and_fit(found, other, alignment, extent, settings.align, pairs, END_LIMIT)
-        if fit is None:
+        again = _match_and_fit(found, other, alignment, extent, settings.align, pairs, start_limit=END_LIMIT)
+        if again is None:
             break
-        alignment = Alignment(fit[1].rotation, fit[1].translation, alignment.time_offset)
-        matched = fit[2]
-    return alignment
+        fit, alignment = again, again.alignment
+    return replace(fit, alignment=alignment)
 
 
 def rigid_motion(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -167,11 +203,13 @@ def _match_and_fit(
     extent: float,
     align: bool,
     pairs: Pairs | None,
+    *,
     start_limit: float = START_LIMIT,
-) -> tuple[float, Alignment, Pairs] | None:
-    """Match trajectories and fit the rigid motion in turn; the cost is the mean distance, capped for the unmatched."""
+    rounds: int = ROUNDS,
+) -> _Fit | None:
+    """Match trajectories and fit the rigid motion in turn."""
     R, t = start.rotation, start.translation
-    limits = np.geomspace(start_limit, END_LIMIT, ROUNDS) * extent
+    limits = np.geomspace(start_limit, END_LIMIT, rounds) * extent
     seen = np.isfinite(found).all(-1)[:, :, None] & np.isfinite(other).all(-1)[:, None]
     count = seen.sum(axis=0)
     if not (count >= FEWEST_FRAMES).any():
@@ -202,7 +240,7 @@ def _match_and_fit(
     costs = [min(mean[i, j], cap) for i, j in matched]
     unmatched = min(mean.shape) - len(matched) if pairs is None else 0
     cost = (sum(costs) + unmatched * cap) / (len(costs) + unmatched)
-    return float(cost), Alignment(R, t, start.time_offset), matched
+    return _Fit(float(cost), Alignment(R, t, start.time_offset), matched)
 
 
 def _paired(found: np.ndarray, other: np.ndarray, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
