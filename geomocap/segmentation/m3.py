@@ -22,6 +22,9 @@ from geomocap.segmentation.splitting import SplitFrame, split_frame
 Points = Callable[[int], np.ndarray]
 """Gives the (N, 3) points of a frame, metres, world; called when they are needed, more than once if iterative."""
 
+_STILL = 1.0
+"""Relative paths that stay closer than this, spacings, show no motion, whatever the statistics say."""
+
 
 def segment_m3(
     points: Points | Sequence[np.ndarray],
@@ -74,7 +77,7 @@ def segment_m3(
     paths = run(points, progress)
     # Step 3: rigid bodies from relative paths
     integrals = path_integrals(paths.ellipsoids.centers)
-    threshold = similarity_threshold(integrals, settings.body_deviations)
+    threshold = max(similarity_threshold(integrals, settings.body_deviations), _STILL * spacing)
     if frames == 1:
         grouping = Grouping(np.full(len(integrals), -1, np.int32), np.empty(0, np.int32), integrals, threshold)
     elif settings.iterative:

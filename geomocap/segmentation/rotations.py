@@ -7,7 +7,7 @@ import numpy as np
 from geomocap.segmentation.ellipsoids import SHELL, Ellipsoids
 
 _AXES = 1.0
-_INERTIA = 0.02
+_INERTIA = 0.3
 
 
 def body_rotations(ellipsoids: Ellipsoids, body: np.ndarray, bodies: Ellipsoids) -> np.ndarray:
@@ -60,7 +60,7 @@ def body_rotations(ellipsoids: Ellipsoids, body: np.ndarray, bodies: Ellipsoids)
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Return the proper rotation R that maximises trace(Rᵀ M) (Kabsch 1976, Umeyama 1991)."""
+    """Return the proper rotations R that maximise trace(Rᵀ M) for matrices (…, 3, 3) (Kabsch 1976, Umeyama 1991)."""
     u, _, vt = np.linalg.svd(matrix)
-    u[:, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    u[..., 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[..., None]
     return u @ vt

@@ -27,7 +27,7 @@ class SegmentationSettings(Settings):
         description="fitting error above which an ellipsoid is split (equivalent length, point spacings)",
     )
     merge_error: float = Field(
-        default=0.5,
+        default=2.0,
         ge=0,
         description="fitting error below which neighbours of the first frame are merged (equivalent length, spacings)",
     )
@@ -40,7 +40,7 @@ class SegmentationSettings(Settings):
         description="matching: weight of neighbours that move differently against a distance of centres (no unit)",
     )
     body_deviations: float = Field(
-        default=0.75,
+        default=1.0,
         description="paths closer than this many standard deviations below the mean of the logarithms belong to one "
         "body; larger: more bodies (no unit)",
     )

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from geomocap.segmentation.rotations import nearest_rotation
 from geomocap.skeleton.hierarchy import Hierarchy
+
+_TURNED = 0.2
+_ROUNDS = 4
 
 
 def local_rotations(body_rotations: np.ndarray, hierarchy: Hierarchy) -> np.ndarray:
@@ -111,3 +115,75 @@ def fit_offsets(
     # what the motion leaves open is decided by the shortest bones
     solution = np.linalg.solve(normal + 1e-6 * len(body_rotations) * np.eye(size), right).reshape(-1, 3)
     return solution[:joints], solution[joints:]
+
+
+def turn_bones(
+    hierarchy: Hierarchy,
+    offsets: np.ndarray,
+    body_offsets: np.ndarray,
+    body_rotations: np.ndarray,
+    root_positions: np.ndarray,
+    joint_positions: np.ndarray,
+    body_positions: np.ndarray,
+) -> np.ndarray:
+    """Turn each bone towards the joints and the body centre found at its far end, from the root outward.
+
+    A body's rotation is the one nearest (Kabsch) to its child joints and its centre as seen from its own joint of the
+    forward kinematics, and weakly to the rotation that the segmentation gave, which decides the roll of a bone with
+    one joint.
+
+    Parameters
+    ----------
+    hierarchy, offsets, body_offsets, root_positions
+        See `forward_kinematics` and `fit_offsets`.
+    body_rotations : (T, B, 3, 3) float
+        Given by the segmentation.
+    joint_positions : (T, J, 3) float, metres
+        Found in each frame.
+    body_positions : (T, B, 3) float, metres
+
+    Returns
+    -------
+    (T, B, 3, 3) float
+        Since frame 0, world axes; the identity in frame 0.
+    """
+    turned = body_rotations.copy()
+    positions = np.empty((len(turned), len(offsets), 3))
+    own = hierarchy.body_joints
+    for body in [hierarchy.root, *hierarchy.joint_bodies[:, 1].tolist()]:
+        joint = own[body]
+        if joint >= 0:
+            parent = hierarchy.joint_bodies[joint, 0]
+            start = root_positions if own[parent] < 0 else positions[:, own[parent]]
+            positions[:, joint] = start + turned[:, parent] @ offsets[joint]
+        origin = root_positions if joint < 0 else positions[:, joint]
+        children = np.flatnonzero(hierarchy.joint_bodies[:, 0] == body)
+        rest = np.concatenate([offsets[children], body_offsets[[body]]])
+        seen = np.concatenate([joint_positions[:, children], body_positions[:, [body]]], axis=1) - origin[:, None]
+        evidence = np.einsum("tni,nj->tij", seen, rest) + _TURNED * (rest**2).sum() * body_rotations[:, body]
+        evidence[0] = np.eye(3)
+        turned[:, body] = nearest_rotation(evidence)
+    return turned
+
+
+def fit_motion(
+    hierarchy: Hierarchy,
+    body_rotations: np.ndarray,
+    root_positions: np.ndarray,
+    joint_positions: np.ndarray,
+    body_positions: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find bones of constant length and their turns, by turns: `fit_offsets`, then `turn_bones`.
+
+    Returns
+    -------
+    body_rotations : (T, B, 3, 3) float
+    offsets : (J, 3) float, metres
+    body_offsets : (B, 3) float, metres
+    """
+    turned = body_rotations
+    found = (root_positions, joint_positions, body_positions)
+    for _ in range(_ROUNDS):
+        offsets, body_offsets = fit_offsets(hierarchy, turned, *found)
+        turned = turn_bones(hierarchy, offsets, body_offsets, body_rotations, *found)
+    return turned, *fit_offsets(hierarchy, turned, *found)

@@ -11,7 +11,7 @@ from geomocap.errors import GeometryError
 from geomocap.segmentation.segmentation import Segmentation
 from geomocap.skeleton.hierarchy import Hierarchy, connect_bodies
 from geomocap.skeleton.joints import grow_joints
-from geomocap.skeleton.motion import fit_offsets, forward_kinematics, local_rotations
+from geomocap.skeleton.motion import fit_motion, forward_kinematics, local_rotations
 from geomocap.skeleton.settings import SkeletonSettings
 
 
@@ -165,9 +165,10 @@ def skeleton_m3(segmentation: Segmentation, fps: float, settings: SkeletonSettin
     step = settings.sample_step * segmentation.spacing
     found, _ = grow_joints(bodies.centers, bodies.radii, bodies.rotations, hierarchy.joint_bodies, step)
     # Motion
-    turned = segmentation.body_rotations
     root_positions = bodies.centers[:, hierarchy.root]
-    offsets, body_offsets = fit_offsets(hierarchy, turned, root_positions, found, bodies.centers)
+    turned, offsets, body_offsets = fit_motion(
+        hierarchy, segmentation.body_rotations, root_positions, found, bodies.centers
+    )
     relative = local_rotations(turned, hierarchy)
     fixed = forward_kinematics(hierarchy, offsets, relative, root_positions)[0]
     names = np.array([f"body{b:02d}" for b in range(bodies.counts.shape[1])])
