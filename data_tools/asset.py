@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from geomocap.errors import GeomocapError
 
@@ -110,6 +112,10 @@ class AnimatedAsset:
         """Metres per unit of the asset."""
         return float(np.cbrt(abs(np.linalg.det(self.world_from_asset[:3, :3]))))
 
+    @cached_property
+    def _sparse_weights(self) -> csr_array:
+        return csr_array(self.slot_weights)
+
     @property
     def vertex_weights(self) -> np.ndarray:
         """Skin weights of the joints, (V, J) float."""
@@ -132,7 +138,7 @@ class AnimatedAsset:
         skin = self.world_from_asset @ pose.asset_from_joint[self.slot_joints] @ self.slot_from_bind
         homogeneous = np.column_stack([bound, np.ones(len(bound))])
         # Linear blend skinning: the weighted mean of the slots' matrices moves the vertex
-        blended = (self.slot_weights @ skin[:, :3].reshape(len(skin), 12)).reshape(-1, 3, 4)
+        blended = (self._sparse_weights @ skin[:, :3].reshape(len(skin), 12)).reshape(-1, 3, 4)
         return np.einsum("vij,vj->vi", blended, homogeneous)
 
     def joint_transforms(self, time: float | None) -> tuple[np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ from geomocap.files import write_atomic, write_text
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items
 
-TARGET_SAMPLES = 8  # rays a pixel are this squared
+TARGET_SAMPLES = 16  # rays a pixel are this squared
 ROOM_LIGHT = 0.06  # of the room's usual light
 TARGET_LEVEL, ROD_LEVEL = 225.0, 14.0  # grey levels
 
@@ -87,7 +87,7 @@ def _seen(rig: Rig, pair: np.ndarray, radius: float) -> np.ndarray:
     with np.errstate(invalid="ignore", divide="ignore"):
         reach = 2 + (focal[:, None] * radius / depth).max(axis=1)
         inside = (pixels > reach[:, None, None]) & (pixels < rig.sizes[:, None] - reach[:, None, None])
-        apart = np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=1) > 4 * reach
+        apart = np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=1) > 2 * reach - 2
     return inside.all(axis=(1, 2)) & apart & (depth > 0.1).all(axis=1)
 
 

@@ -329,7 +329,7 @@ class _Reader:
         if not primitive.targets:
             return {}
         if node not in self.morph_start:
-            rest = self.gltf.nodes[node].weights or mesh.weights or [0.0] * len(primitive.targets)
+            rest = getattr(self.gltf.nodes[node], "weights", None) or mesh.weights or [0.0] * len(primitive.targets)
             self.morph_start[node] = sum(len(w) for _, w in self.morphs)
             self.morphs.append((node, np.array(rest, dtype=float)))
         moved = {}

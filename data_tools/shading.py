@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -10,6 +10,9 @@ from numba import njit
 
 from data_tools.asset import AnimatedAsset
 from data_tools.solid_noise import fabric_noise, gradient_noise
+
+MEAN_LEVEL = 125.0  # grey levels, of the subject under light of strength 1
+DARKEST, BRIGHTEST = 0.08, 0.85  # shares of the light that black and white surfaces return, so that both show fabric
 
 
 @dataclass(frozen=True)
@@ -29,8 +32,8 @@ class Surface:
         All textures, one after the other, row by row.
     texture_shapes : (K, 3) int64
         Of each texture: first texel, height, width.
-    brightness : float
-        Factor on the asset's colours, so that dark subjects are well exposed.
+    exponent : float
+        Of the asset's colours (0 … 1), so that dark and bright subjects are well exposed; black and white stay.
     cells, weights : (O,) float64
         Cell sizes (metres) and weights of the fabric's octaves.
     seed : int
@@ -44,7 +47,7 @@ class Surface:
     face_textures: np.ndarray
     texels: np.ndarray
     texture_shapes: np.ndarray
-    brightness: float
+    exponent: float
     cells: np.ndarray
     weights: np.ndarray
     seed: int
@@ -91,7 +94,7 @@ class Surface:
             face_textures=np.ascontiguousarray(asset.face_textures, dtype=np.int32),
             texels=np.concatenate([t.reshape(-1, 3) for t in textures] or [np.zeros((1, 3), np.uint8)]),
             texture_shapes=np.array(shapes, dtype=np.int64).reshape(-1, 3),
-            brightness=1.0,
+            exponent=1.0,
             cells=cells,
             # Gradient noise has a standard deviation of 0.27; octaves are independent
             weights=contrast * weights / (0.27 * np.linalg.norm(weights)),
@@ -100,13 +103,17 @@ class Surface:
         return surface._exposed(area)
 
     def _exposed(self, area: np.ndarray) -> Surface:
-        """Return the surface with the brightness that makes its mean colour a good middle grey."""
+        """Return the surface with the exponent that makes its mean colour a good middle grey."""
         n = len(self.faces)
-        white = np.array([0.0, 0, 1, 0, 0, 1, 1.0, 0, 0])
-        flat = self.__class__(**{**self.__dict__, "weights": np.zeros_like(self.weights)})
-        colors = flat.shade(np.zeros((len(self.fabric), 3)), np.arange(n), np.full((n, 2), 1 / 3, np.float32), white)
-        mean = float(np.average(colors.mean(axis=1), weights=np.maximum(area, 1e-12)))
-        return self.__class__(**{**self.__dict__, "brightness": float(np.clip(140.0 / max(mean, 1.0), 0.5, 4.0))})
+        flat = replace(self, weights=np.zeros_like(self.weights))
+        white, centers = np.array([0.0, 0, 1, 0, 0, 1, 1.0, 0, 0]), np.full((n, 2), 1 / 3, np.float32)
+        low, high = 0.25, 3.0
+        for _ in range(20):
+            middle = (low + high) / 2
+            colors = replace(flat, exponent=middle).shade(np.zeros_like(self.fabric), np.arange(n), centers, white)
+            mean = float(np.average(colors.mean(axis=1), weights=np.maximum(area, 1e-12)))
+            low, high = (middle, high) if mean > MEAN_LEVEL else (low, middle)
+        return replace(self, exponent=(low + high) / 2)
 
     def normals(self, vertices: np.ndarray) -> np.ndarray:
         """Smooth vertex normals, weighted by area, of a posed mesh: (V, 3) float64."""
@@ -143,7 +150,7 @@ class Surface:
             self.face_textures,
             self.texels,
             self.texture_shapes,
-            self.brightness,
+            self.exponent,
             self.cells,
             self.weights,
             self.seed,
@@ -176,7 +183,7 @@ def _shade(
     face_textures: np.ndarray,
     texels: np.ndarray,
     texture_shapes: np.ndarray,
-    brightness: float,
+    exponent: float,
     cells: np.ndarray,
     weights: np.ndarray,
     seed: int,
@@ -206,15 +213,16 @@ def _shade(
             weave = min(1.9, max(0.12, 1.0 + noise))
             coarse = 1.3 * cells[len(cells) - 1]
             hue = weights[0] * gradient_noise(place[0] / coarse, place[1] / coarse, place[2] / coarse, seed + 99)
-        level *= brightness * weave
+        level *= 255.0 * weave
         material = face_textures[t]
         for k in range(3):
-            value = 255.0
+            value = 1.0
             if material >= 0:
                 u = w0 * uv[a, 0] + w1 * uv[b, 0] + w2 * uv[c, 0]
                 v = w0 * uv[a, 1] + w1 * uv[b, 1] + w2 * uv[c, 1]
                 first, height, width = texture_shapes[material]
-                value = _texel(texels, first, height, width, u, v, k)
-            tint = 1.0 + (hue if k == 0 else (-0.7 * hue if k == 2 else 0.0)) * 0.6
-            out[i, k] = level * tint * value * color[k]
+                value = _texel(texels, first, height, width, u, v, k) / 255.0
+            tint = 1.0 + (hue if k == 0 else (-0.7 * hue if k == 2 else 0.0)) * 0.4
+            albedo = max(0.0, value * color[k]) ** exponent
+            out[i, k] = level * tint * (DARKEST + (BRIGHTEST - DARKEST) * albedo)
     return out

@@ -52,7 +52,7 @@ def capsule(length: float, radius: tuple[float, float], width: float = 1.0, ring
     group = np.arange(len(r) * (sides + 1)).reshape(len(r), sides + 1)
     group[:, -1] = group[:, 0]
     group[0], group[-1] = group[0, 0], group[-1, 0]
-    return Solid(vertices, _grid_faces(len(r), sides + 1), uv, group.ravel())
+    return Solid(vertices, _with_area(vertices, _grid_faces(len(r), sides + 1)), uv, group.ravel())
 
 
 def ellipsoid(radii: tuple[float, float, float], center: tuple[float, float, float], rings: int = 15) -> Solid:
@@ -100,7 +100,7 @@ def cylinder(radius: float, half_length: float, axis: int, sides: int = 32) -> S
         rows[:, -1] = rows[:, 0]
         group.append(rows.ravel())
     turned = np.roll(np.concatenate(vertices), axis + 1, axis=1)
-    return Solid(turned, np.concatenate(faces), np.concatenate(uv), np.concatenate(group))
+    return Solid(turned, _with_area(turned, np.concatenate(faces)), np.concatenate(uv), np.concatenate(group))
 
 
 def _grid_faces(rows: int, columns: int) -> np.ndarray:
@@ -108,3 +108,9 @@ def _grid_faces(rows: int, columns: int) -> np.ndarray:
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
     return np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([b, c, d], -1).reshape(-1, 3)])
+
+
+def _with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Leave out the triangles that have shrunk to a line, at poles."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12]

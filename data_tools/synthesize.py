@@ -187,9 +187,11 @@ def make_world(vertices: np.ndarray, settings: SynthesisSettings) -> World:
     low, high = points.min(axis=0), points.max(axis=0)
     everything = np.concatenate([rig.centers, points])
     margin = 0.3 * float((high - low).max())
-    room_low, room_high = everything.min(axis=0) - margin, everything.max(axis=0) + margin
-    room_low[2] = 0.0
-    depth = np.einsum("ci,ci->c", (low + high) / 2 - rig.centers, rig.viewing_directions)
+    middle = (low + high) / 2
+    half = float(np.abs(everything - middle)[:, :2].max()) + margin
+    room_low = np.array([middle[0] - half, middle[1] - half, 0.0])
+    room_high = np.array([middle[0] + half, middle[1] + half, everything[:, 2].max() + margin])
+    depth = np.einsum("ci,ci->c", middle - rig.centers, rig.viewing_directions)
     focal = np.array([c.mean_focal_length() for c in rig.cameras])
     return World(
         rig=rig,
