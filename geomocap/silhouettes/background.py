@@ -15,6 +15,7 @@ from geomocap.silhouettes.settings import SilhouetteSettings
 
 LEAST_NOISE = 0.7  # grey levels; 8-bit rounding alone gives 0.29, compression hides the rest in flat parts
 GRADIENT_BINS = 12
+MOST_JITTER = 0.3  # pixels that edges move at most, by compression and vibration
 LIT = 0.15  # fraction of the frames that must show a place lit for the others to be its shadow
 
 
@@ -165,11 +166,14 @@ def background_over_time(
             f"background{_of(camera)}: {len(frames)} frames; an estimate over time needs at least 3: "
             "record more, or add an empty picture to background/"
         )
+    shape = frames[0].shape[:2]
+    flat = BackgroundModel(np.zeros((*shape, 3)), np.ones(shape), np.ones(shape, bool), camera)
+    for image in frames:
+        flat.check(image)
     stack = np.stack(list(frames))
     median = np.median(stack, axis=0).astype(np.float32)
     known = np.ones(median.shape[:2], bool)
     model = BackgroundModel(median, np.full(known.shape, 2.0, np.float32), known, camera)
-    model.check(frames[0])
     lights = [_light(image, model, settings) for image in frames]
     sigma = _noise(frames, lights, model)
     gains = np.array([g for g, _ in lights], np.float32)
@@ -218,8 +222,8 @@ def _noise(
             x.append(np.median(g[inside]) ** 2)
             y.append((1.4826 * np.median(np.abs(r))) ** 2)
     a = max(float(np.median(y[: max(1, len(y) // 2)])), LEAST_NOISE**2)
-    steepest = [(max(0.0, v - a), u) for u, v in zip(x, y, strict=True) if u > 1.0][-4:]
-    b = sum(v for v, _ in steepest) / sum(u for _, u in steepest) if steepest else 0.0
+    steepest = [max(0.0, v - a) / u for u, v in zip(x, y, strict=True) if u > 4.0][-4:]
+    b = min(float(np.median(steepest)), MOST_JITTER**2) if steepest else 0.0
     return np.sqrt(a + b * gradient**2).astype(np.float32)
 
 

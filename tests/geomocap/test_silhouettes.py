@@ -238,6 +238,20 @@ def test_pieces_of_several_subjects_stay_and_specks_go(walk: Scene, model: Backg
     assert overlap(mask, truth) > 0.8
 
 
+def test_the_subject_before_the_sharpest_edges_is_no_noise() -> None:
+    rng = np.random.default_rng(8)
+    plate = np.full((120, 160, 3), 110.0)
+    plate[60:] = 60.0  # one sharp edge, half covered at all times
+    image = plate.copy()
+    image[40:80, 20:130] = [30, 80, 160]
+    frames = [np.clip(image + rng.normal(0, 1.5, plate.shape), 0, 255).astype(np.uint8) for _ in range(4)]
+    model = model_from_plate(plate.astype(np.uint8), frames)
+    assert model.sigma.max() < 10
+    truth = np.zeros((120, 160), bool)
+    truth[40:80, 20:130] = True
+    assert overlap(silhouette(frames[0], model), truth) > 0.99
+
+
 def test_bad_input_is_named(walk: Scene, model: BackgroundModel) -> None:
     with pytest.raises(CaptureError, match="camera left: 320×240 pixels, but the images are 160×120"):
         silhouette(np.zeros((120, 160, 3), np.uint8), model)
@@ -249,6 +263,8 @@ def test_bad_input_is_named(walk: Scene, model: BackgroundModel) -> None:
         model_from_plate(walk.plate, [])
     with pytest.raises(CaptureError, match="at least 3"):
         model_from_frames(walk.frames[:2], camera="left")
+    with pytest.raises(CaptureError, match="camera left: 320×240 pixels, but the images are 100×50"):
+        model_from_frames([*walk.frames[:3], np.zeros((50, 100, 3), np.uint8)], camera="left")
     with pytest.raises(CaptureError, match="region of interest"):
         silhouette(walk.frames[0], model, region=np.ones((2, 2), bool))
     with pytest.raises(CaptureError, match="don't fit"):
