@@ -1,1 +1,29 @@
-"""Space carving: silhouettes to surface voxels."""
+"""Space carving: silhouettes to coloured surface voxels."""
+
+from geomocap.carving.agreement import check_agreement, check_cameras, check_inside, check_silhouettes
+from geomocap.carving.frames import carve_frame, needs_images
+from geomocap.carving.grid import Grid
+from geomocap.carving.hull import hull, hull_surface, visual_hull
+from geomocap.carving.settings import CarvingSettings, ConsistencySettings, HullSettings
+from geomocap.carving.views import PinholeViews, Undistortion, undistort_masks
+from geomocap.carving.volume import working_volume
+
+__all__ = [
+    "CarvingSettings",
+    "ConsistencySettings",
+    "Grid",
+    "HullSettings",
+    "PinholeViews",
+    "Undistortion",
+    "carve_frame",
+    "check_agreement",
+    "check_cameras",
+    "check_inside",
+    "check_silhouettes",
+    "hull",
+    "hull_surface",
+    "needs_images",
+    "undistort_masks",
+    "visual_hull",
+    "working_volume",
+]

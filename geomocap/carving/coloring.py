@@ -9,20 +9,20 @@ from scipy.spatial import cKDTree
 from geomocap.carving.grid import Grid
 from geomocap.carving.occupancy import Occupancy
 from geomocap.carving.views import PinholeViews
-from geomocap.carving.visibility import depth_buffers, normals, sightings
+from geomocap.carving.visibility import SurfaceVoxels, depth_buffers, normals, sightings
 
 GREY = 160
 
 
-def voxel_colors(
-    views: PinholeViews, images: np.ndarray, grid: Grid, occupancy: Occupancy, surface: np.ndarray
-) -> np.ndarray:
-    """Colour surface voxels by the weighted median of the cameras that see them, (N, 3) uint8, RGB.
+def voxel_colors(views: PinholeViews, images: np.ndarray, grid: Grid, occupancy: Occupancy) -> np.ndarray:
+    """Colour the surface voxels of an occupancy, (N, 3) uint8 RGB, by the weighted median of what sees them.
 
     A camera weighs with the squared cosine between its ray and the surface's normal. Voxels that no camera sees take
     the colour of the nearest one that is seen; if none is seen at all they are grey.
     """
-    seen = sightings(views, images, grid, surface, depth_buffers(views, grid, surface))
+    voxels = SurfaceVoxels.of(occupancy)
+    surface = voxels.indices
+    seen = sightings(views, images, grid, voxels, depth_buffers(views, grid, voxels))
     centers = -np.linalg.solve(views.projections[:, :, :3], views.projections[:, :, 3:])[:, :, 0]
     colors = np.full((len(surface), 3), GREY, np.uint8)
     has_color = np.zeros(len(surface), np.bool_)

@@ -13,7 +13,7 @@ from geomocap.carving.grid import Grid
 from geomocap.carving.occupancy import Occupancy
 from geomocap.carving.settings import ConsistencySettings
 from geomocap.carving.views import PinholeViews
-from geomocap.carving.visibility import Sightings, depth_buffers, sightings
+from geomocap.carving.visibility import Sightings, SurfaceVoxels, depth_buffers, sightings
 
 
 def carve_inconsistent(
@@ -44,16 +44,16 @@ def carve_inconsistent(
     changed = np.ones_like(bits, dtype=np.bool_)
     gains = np.ones((len(views), 3), np.float32)
     for step in range(settings.max_passes):
-        surface = Occupancy(bits, occupancy.shape).surface_indices()
+        surface = SurfaceVoxels.of(Occupancy(bits, occupancy.shape))
         depth = depth_buffers(views, grid, surface)
-        voxels = surface if step == 0 else surface[_near(changed, surface)]
+        voxels = surface if step == 0 else surface.select(_near(changed, surface.indices))
         seen = sightings(views, images, grid, voxels, depth, settings.window)
         if step == 0 and settings.gain:
             gains = camera_gains(seen)
         deviation = color_deviation(seen, gains, settings.min_cameras)
-        _judge(voxels, deviation, settings.threshold, judged, bad)
+        _judge(voxels.indices, deviation, settings.threshold, judged, bad)
         changed[:] = False
-        if _take(bits, surface, settings.support, judged, bad, changed) == 0:
+        if _take(bits, surface.indices, settings.support, judged, bad, changed) == 0:
             break
     return Occupancy(bits, occupancy.shape)
 

@@ -63,7 +63,7 @@ def carve_frame(
         surface = occupancy.surface_indices()
 
     if images is not None and settings.colors == "visible":
-        colors = voxel_colors(views, images, grid, occupancy, surface)
+        colors = voxel_colors(views, images, grid, occupancy)
     else:
         colors = np.full((len(surface), 3), GREY, np.uint8)
     return Voxels(surface, colors, grid.origin, grid.voxel_size)

@@ -28,7 +28,7 @@ class ConsistencySettings(Settings):
 
     enabled: bool = Field(default=True, description="carve surface voxels whose colours differ between the cameras")
     threshold: float = Field(
-        default=10.0, gt=0, description="colour deviation above which a voxel goes (grey values, 0–255)"
+        default=8.0, gt=0, description="colour deviation above which a voxel goes (grey values, 0–255)"
     )
     window: int = Field(
         default=0, ge=0, le=5, description="how far a projection may be off: radius of the window (pixels)"

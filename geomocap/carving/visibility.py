@@ -1,7 +1,7 @@
 """Which camera sees which surface voxel, and the colour that it sees there.
 
 Surface voxels are drawn into one depth buffer a camera, each as the rectangle round its projected cube. A voxel is seen
-where nothing lies clearly before its centre.
+if one of its free faces is turned to the camera and nothing lies clearly before its centre.
 """
 
 from __future__ import annotations
@@ -38,15 +38,41 @@ class Sightings:
     high: np.ndarray
 
 
-def depth_buffers(views: PinholeViews, grid: Grid, surface: np.ndarray) -> np.ndarray:
-    """Draw surface voxels (N, 3) as cubes: depth of the nearest, (C, H, W) float32, metres; inf where none is."""
+@dataclass(frozen=True)
+class SurfaceVoxels:
+    """Surface voxels with their free faces.
+
+    Attributes
+    ----------
+    indices : (N, 3) int32
+    faces : (N,) uint8
+        Bits 0 to 5: nothing occupied on the side of −x, +x, −y, +y, −z, +z.
+    """
+
+    indices: np.ndarray
+    faces: np.ndarray
+
+    @classmethod
+    def of(cls, occupancy: Occupancy) -> SurfaceVoxels:
+        """Find the surface of an occupancy."""
+        indices = occupancy.surface_indices()
+        return cls(indices, _free_faces(occupancy.bits, indices))
+
+    def select(self, which: np.ndarray) -> SurfaceVoxels:
+        """Return some of them, by a mask or by positions."""
+        return SurfaceVoxels(self.indices[which], self.faces[which])
+
+
+def depth_buffers(views: PinholeViews, grid: Grid, surface: SurfaceVoxels) -> np.ndarray:
+    """Draw surface voxels as cubes: depth of the nearest, (C, H, W) float32, metres; inf where none is."""
     depth = np.full(views.masks.shape, np.inf, np.float32)
-    _draw(views.projections, np.ascontiguousarray(surface, np.int32), grid.origin, grid.voxel_size, depth)
+    P = views.projections
+    _draw(P, _centers(P), surface.indices, surface.faces, grid.origin, grid.voxel_size, depth)
     return depth
 
 
 def sightings(
-    views: PinholeViews, images: np.ndarray, grid: Grid, voxels: np.ndarray, depth: np.ndarray, window: int = 0
+    views: PinholeViews, images: np.ndarray, grid: Grid, voxels: SurfaceVoxels, depth: np.ndarray, window: int = 0
 ) -> Sightings:
     """Find which cameras see each of some surface voxels and with which colour.
 
@@ -56,23 +82,25 @@ def sightings(
     images : (C, H, W, 3) uint8
         Undistorted images on the canvas of the views.
     grid : Grid
-    voxels : (N, 3) int
+    voxels : SurfaceVoxels
     depth : (C, H, W) float32
         Depth buffers of the whole surface.
     window : int
         Radius of the window of `low` and `high`, pixels; 0: the voxel's own pixels.
     """
-    N, C = len(voxels), len(views)
+    N, C = len(voxels.indices), len(views)
     seen = np.zeros((N, C), np.uint8)
     colors = np.zeros((N, C, 3), np.float32)
     low, high = np.zeros((N, C, 3), np.uint8), np.zeros((N, C, 3), np.uint8)
     _look(
         views.projections,
+        _centers(views.projections),
         views.masks,
         views.valid,
         images,
         depth,
-        np.ascontiguousarray(voxels, np.int32),
+        voxels.indices,
+        voxels.faces,
         grid.origin,
         grid.voxel_size,
         DEPTH_SLACK * grid.voxel_size,
@@ -91,8 +119,36 @@ def normals(occupancy: Occupancy, surface: np.ndarray) -> np.ndarray:
     return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-6)
 
 
+def _centers(P: np.ndarray) -> np.ndarray:
+    return -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[:, :, 0]
+
+
+@njit(cache=True, nogil=True)
+def _free_faces(bits, surface):
+    X, Y, K = bits.shape
+    steps = ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))
+    faces = np.zeros(len(surface), np.uint8)
+    for n in range(len(surface)):
+        free = 0
+        for f in range(6):
+            i, j, k = surface[n, 0] + steps[f][0], surface[n, 1] + steps[f][1], surface[n, 2] + steps[f][2]
+            inside = 0 <= i < X and 0 <= j < Y and 0 <= k < 32 * K
+            if not inside or not (bits[i, j, k >> 5] >> np.uint32(k & 31)) & np.uint32(1):
+                free |= 1 << f
+        faces[n] = free
+    return faces
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _faces_camera(faces, dx, dy, dz, half):
+    """Whether a free face is turned to a camera that lies (dx, dy, dz) from the voxel's centre."""
+    turned = (dx < -half) | (dx > half) << 1 | (dy < -half) << 2 | (dy > half) << 3
+    turned |= (dz < -half) << 4 | (dz > half) << 5
+    return (turned & faces) != 0
+
+
 @njit(cache=True, nogil=True, parallel=True)
-def _draw(P, surface, origin, edge, depth):
+def _draw(P, centers, surface, faces, origin, edge, depth):
     C, H, W = depth.shape
     half = 0.5 * edge
     for c in prange(C):
@@ -100,6 +156,8 @@ def _draw(P, surface, origin, edge, depth):
             x = origin[0] + (surface[n, 0] + 0.5) * edge
             y = origin[1] + (surface[n, 1] + 0.5) * edge
             z = origin[2] + (surface[n, 2] + 0.5) * edge
+            if not _faces_camera(faces[n], centers[c, 0] - x, centers[c, 1] - y, centers[c, 2] - z, half):
+                continue
             w = P[c, 2, 0] * x + P[c, 2, 1] * y + P[c, 2, 2] * z + P[c, 2, 3]
             if w <= edge:
                 continue
@@ -124,7 +182,9 @@ def _draw(P, surface, origin, edge, depth):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _look(P, masks, valid, images, depth, surface, origin, edge, slack, window, seen, colors, low, high):
+def _look(
+    P, centers, masks, valid, images, depth, surface, faces, origin, edge, slack, window, seen, colors, low, high
+):
     C, H, W = masks.shape
     half = 0.5 * edge
     for n in prange(len(surface)):
@@ -132,6 +192,8 @@ def _look(P, masks, valid, images, depth, surface, origin, edge, slack, window, 
         y = origin[1] + (surface[n, 1] + 0.5) * edge
         z = origin[2] + (surface[n, 2] + 0.5) * edge
         for c in range(C):
+            if not _faces_camera(faces[n], centers[c, 0] - x, centers[c, 1] - y, centers[c, 2] - z, half):
+                continue
             w = P[c, 2, 0] * x + P[c, 2, 1] * y + P[c, 2, 2] * z + P[c, 2, 3]
             if w <= edge:
                 continue

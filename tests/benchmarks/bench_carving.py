@@ -12,6 +12,7 @@ from geomocap.carving.hull import hull, hull_surface, visual_hull
 from geomocap.carving.reference import visual_hull_brute, visual_hull_numpy
 from geomocap.carving.settings import CarvingSettings, ConsistencySettings, HullSettings
 from geomocap.carving.views import PinholeViews
+from geomocap.carving.visibility import SurfaceVoxels, depth_buffers
 from tests.benchmarks.table import Row, measure
 from tests.geomocap.carving_scenes import FIGURE, ring, silhouettes
 
@@ -31,12 +32,18 @@ def carve_with_open3d(P: np.ndarray, masks: list[np.ndarray]) -> o3d.geometry.Vo
 
 
 def textured_images(views: PinholeViews) -> np.ndarray:
-    """Pictures with a fine pattern and noise: what colour consistency has to read."""
+    """Pictures of a surface with a texture fixed in space, and noise: what colour consistency has to read."""
     rng = np.random.default_rng(0)
-    C, H, W = views.masks.shape
-    y, x = np.mgrid[0:H, 0:W]
-    pattern = 128 + 60 * np.sin(x / 4) * np.cos(y / 5)
-    return np.clip(pattern[None, ..., None] + rng.normal(0, 4, (C, H, W, 3)), 0, 255).astype(np.uint8)
+    depth = depth_buffers(views, GRID, SurfaceVoxels.of(hull(views, GRID)))
+    C, H, W = depth.shape
+    v, u = np.mgrid[0:H, 0:W] + 0.5
+    images = np.full((C, H, W, 3), 90.0)
+    for c, P in enumerate(views.projections):
+        hit = np.isfinite(depth[c])
+        rays = np.stack([u, v, np.ones_like(u)], axis=-1)[hit] * depth[c][hit][:, None] - P[:, 3]
+        phase = np.linalg.solve(P[:, :3], rays.T).T * 2 * np.pi / 0.15
+        images[c][hit] = 128 + 90 * np.sin(phase + phase[:, [1, 2, 0]])
+    return np.clip(images + rng.normal(0, 3, images.shape), 0, 255).astype(np.uint8)
 
 
 def benchmark() -> list[Row]:

@@ -14,7 +14,7 @@ from geomocap.carving.hull import hull
 from geomocap.carving.occupancy import Occupancy
 from geomocap.carving.settings import CarvingSettings, ConsistencySettings
 from geomocap.carving.views import PinholeViews
-from geomocap.carving.visibility import Sightings, depth_buffers, normals, sightings
+from geomocap.carving.visibility import Sightings, SurfaceVoxels, depth_buffers, normals, sightings
 from tests.geomocap.carving_scenes import look_at, ring
 
 WIDTH, HEIGHT = 240, 180
@@ -124,7 +124,7 @@ def test_brightness_of_the_cameras_makes_no_difference(solid):
     views, images = solid
     factor = np.random.default_rng(0).uniform(0.75, 1.0, size=(len(views), 1, 1, 3))
     dimmed = (images * factor).astype(np.uint8)
-    surface = hull(views, GRID).surface_indices()
+    surface = SurfaceVoxels.of(hull(views, GRID))
     seen = sightings(views, dimmed, GRID, surface, depth_buffers(views, GRID, surface))
     gains = camera_gains(seen)
     product = gains * factor[:, 0, 0]
@@ -146,7 +146,8 @@ def test_visibility_is_that_of_ray_casting():
     surface = occupancy.surface_indices()
     P = cameras(4)
     views, images = photograph(scene, P)
-    seen = sightings(views, images, GRID, surface, depth_buffers(views, GRID, surface)).seen
+    voxels = SurfaceVoxels.of(occupancy)
+    seen = sightings(views, images, GRID, voxels, depth_buffers(views, GRID, voxels)).seen
     n = normals(occupancy, surface)
     agree = total = 0
     for c, camera in enumerate(P):
@@ -208,7 +209,7 @@ def test_colors_are_those_of_the_surface(solid):
     views, images = solid
     occupancy = hull(views, GRID)
     surface = occupancy.surface_indices()
-    colors = voxel_colors(views, images, GRID, occupancy, surface)
+    colors = voxel_colors(views, images, GRID, occupancy)
     assert colors.shape == surface.shape and colors.dtype == np.uint8
     points = GRID.centers(surface)
     near = (points[:, 2] > 0.05) & (points[:, 2] < 0.45)
@@ -239,9 +240,19 @@ def test_what_nobody_sees_takes_its_neighbour_s_colour():
     views, images = photograph(scene_of(box_mesh([-0.35, -0.35, 0], [0.35, 0.35, 0.5])), P)
     grid = Grid.of_box([-0.6, -0.6, -0.1], [0.6, 0.6, 0.6], resolution=60)
     occupancy = hull(views, grid)
-    surface = occupancy.surface_indices()
-    seen = sightings(views, images, grid, surface, depth_buffers(views, grid, surface)).seen.any(axis=1)
-    colors = voxel_colors(views, images, grid, occupancy, surface)
+    voxels = SurfaceVoxels.of(occupancy)
+    seen = sightings(views, images, grid, voxels, depth_buffers(views, grid, voxels)).seen.any(axis=1)
+    colors = voxel_colors(views, images, grid, occupancy)
     assert 0.2 < seen.mean() < 0.9
     known = {tuple(c) for c in colors[seen]}
     assert all(tuple(c) in known for c in colors[~seen])
+
+
+def test_free_faces():
+    dense = np.zeros((4, 3, 40), bool)
+    dense[1:3, 1, 31:33] = True
+    dense[0, 0, 39] = True
+    voxels = SurfaceVoxels.of(Occupancy.of_dense(dense))
+    np.testing.assert_array_equal(voxels.indices, np.argwhere(dense))
+    sides = [[i for i in range(6) if (f >> i) & 1] for f in voxels.faces]
+    assert sides == [[0, 1, 2, 3, 4, 5], [0, 2, 3, 4], [0, 2, 3, 5], [1, 2, 3, 4], [1, 2, 3, 5]]
