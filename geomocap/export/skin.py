@@ -39,7 +39,7 @@ def skin_from_run(run: Run, motion: Motion, settings: ExportSettings) -> Skinned
     frame = settings.skin_frame
     file = run.frame_file("bodies", frame)
     if frame >= motion.n_frames or not file.is_file():
-        raise MotionError(f"{file}: missing; the skin needs a frame that was segmented (--skin_frame)")
+        raise MotionError(f"{file}: missing; the skin needs a frame that was segmented (export.skin_frame)")
     points, labels, colors, normals = _read_bodies(file)
     if settings.skin_colors == "true":
         colors = _true_colors(run, frame, points)
@@ -113,7 +113,7 @@ def _read_bodies(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     points = cloud.point.positions.numpy().astype(float)
     labels = cloud.point["body"].numpy().ravel().astype(int)
     if not (labels >= 0).any():
-        raise MotionError(f"{file}: no point belongs to a body; choose another reference frame (--skin_frame)")
+        raise MotionError(f"{file}: no point belongs to a body; choose another reference frame (export.skin_frame)")
     colors = _bytes(cloud.point.colors.numpy()) if "colors" in cloud.point else np.full((len(points), 3), 200, np.uint8)
     normals = cloud.point.normals.numpy().astype(float) if "normals" in cloud.point else None
     return points, labels, colors, normals

@@ -1,0 +1,35 @@
+"""The command `geomocap info`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from geomocap.cli.reports import console
+from geomocap.inspection import describe
+
+
+def info(
+    path: Annotated[
+        Path, typer.Argument(metavar="PATH", help="Capture, run, calibration or truth folder, or a motion file.")
+    ],
+) -> None:
+    """Say what a capture, a run, a calibration, a truth or a motion file holds, and what is wrong with it.
+
+    The exit status is 1 if something is wrong.
+    """
+    told = describe(path)
+    console.print(f"{told.path}: {told.kind}")
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    for what, value in told.facts:
+        table.add_row(f"  {what}", value)
+    if told.facts:
+        console.print(table)
+    for problem in told.problems:
+        console.print(f"wrong: {problem}", markup=False)
+    if not told.problems:
+        console.print("nothing wrong with it")
+    raise typer.Exit(1 if told.problems else 0)

@@ -1,0 +1,45 @@
+"""The result of looking at a file or folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Description:
+    """What something is, what it holds, and what is wrong with it.
+
+    Attributes
+    ----------
+    path : Path
+    kind : str
+        "capture", "run", "calibration", "truth" or "motion file".
+    facts : list of (what, value)
+    problems : list of str
+        One line each; empty if nothing is wrong.
+    """
+
+    path: Path
+    kind: str
+    facts: list[tuple[str, str]] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+    def fact(self, what: str, value: object) -> None:
+        """Add a fact."""
+        self.facts.append((what, str(value)))
+
+    def problem(self, what: object) -> None:
+        """Add something that is wrong, as one line."""
+        self.problems.append(" ".join(str(what).split()))
+
+
+def count(n: int, one: str, many: str | None = None) -> str:
+    """Return a number with its noun: 1 frame, 2 frames."""
+    return f"{n} {one if n == 1 else many or one + 's'}"
+
+
+def shortened(names: list[str], most: int = 12) -> str:
+    """Return names in a row, cut after `most`."""
+    more = f" … and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

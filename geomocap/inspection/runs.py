@@ -1,0 +1,114 @@
+"""Runs, described."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geomocap.errors import GeomocapError
+from geomocap.export.run_export import FILES
+from geomocap.export.skeleton_motion import motion_from_skeleton
+from geomocap.inspection.description import Description, count, shortened
+from geomocap.run import Run
+
+
+def describe_run(path: Path) -> Description:
+    """Describe a run folder."""
+    told, run = Description(path, "run"), Run(path)
+    record: dict[str, Any] = {}
+    try:
+        record = run.read_record()
+    except GeomocapError as error:
+        told.problem(error)
+    source = record.get("source", {})
+    if source:
+        told.fact("made from", f"{source.get('kind', '?')} {source.get('path', '?')}")
+        told.fact("up", source.get("up", "z"))
+    if "geomocap" in record:
+        told.fact("version", record["geomocap"].get("version", "?"))
+    for camera in sorted(p for p in (path / "silhouettes").glob("*") if p.is_dir()):
+        told.fact(f"silhouettes of {camera.name}", count(len(list(camera.glob("*.png"))), "frame"))
+    for kind in ("voxels", "cloud", "bodies"):
+        frames = run.frames(kind)
+        if frames:
+            told.fact(kind, f"{count(len(frames), 'frame')}, {frames[0]:06d} to {frames[-1]:06d}")
+            missing = sorted(set(range(frames[0], frames[-1] + 1)) - set(frames))
+            if missing:
+                told.problem(
+                    f"{kind}/ lacks {count(len(missing), 'frame')} from {missing[0]:06d} on; start the run again"
+                )
+    for name, tell in (
+        ("ellipsoids.npz", _ellipsoids),
+        ("skeleton.npz", _skeleton),
+        ("tracks.npz", _tracks),
+        ("keypoints.npz", _keypoints),
+    ):
+        if (path / name).is_file():
+            try:
+                tell(run.read_npz(name), told)
+            except (GeomocapError, KeyError, ValueError, IndexError) as error:
+                told.problem(f"{name}: {'lacks ' if isinstance(error, KeyError) else ''}{error}")
+    files = [f for f in FILES.values() if (path / f).is_file()]
+    told.fact("motion files", shortened(files) if files else "none")
+    _stages(run, told)
+    return told
+
+
+def _ellipsoids(arrays: dict[str, np.ndarray], told: Description) -> None:
+    frames, number = arrays["centers"].shape[:2]
+    bodies = count(len(np.unique(arrays["body"])), "body", "bodies")
+    told.fact(
+        "ellipsoids",
+        f"{number} in {count(frames, 'frame')}, of {bodies}",
+    )
+
+
+def _skeleton(arrays: dict[str, np.ndarray], told: Description) -> None:
+    motion = motion_from_skeleton(arrays)
+    joints = arrays["joint_positions"]
+    bodies = arrays["body_rotations"].shape[1]
+    told.fact("skeleton", f"{count(joints.shape[1], 'joint')} between {count(bodies, 'body', 'bodies')}")
+    told.fact("motion", f"{motion.n_frames} frames at {motion.fps:g} per second, {motion.n_frames / motion.fps:.2f} s")
+    shifting = int((motion.moving & (motion.joints >= 0)).sum())
+    if shifting:
+        told.fact("joints not fixed in their bodies", f"{shifting}; files shift them in every frame")
+    if len(motion.parents) > 1 and motion.names[0] == "origin":
+        told.problem(f"the skeleton falls into {(motion.parents == 0).sum()} separate parts")
+    gaps = 1 - np.isfinite(joints).all(axis=-1).mean() if joints.size else 0.0
+    if gaps:
+        told.problem(f"joints lack a position in {100 * gaps:.1f} % of the frames; files fill them in")
+    if not np.isfinite(arrays["body_rotations"]).all():
+        told.problem("body rotations hold NaN; files turn evenly across them")
+    elif np.abs(arrays["body_rotations"][0] - np.eye(3)).max() > 1e-3:
+        told.problem("body rotations don't begin at the identity: they aren't rotations since the first frame")
+
+
+def _tracks(arrays: dict[str, np.ndarray], told: Description) -> None:
+    tracked = np.isfinite(arrays["positions"]).all(axis=-1)
+    length = tracked.sum(axis=1)
+    told.fact(
+        "tracks", f"{len(tracked)} points in {tracked.shape[1]} frames, on average {length.mean():.1f} frames long"
+    )
+    if (length == 0).any():
+        told.problem(f"{(length == 0).sum()} tracks have no position in any frame")
+
+
+def _keypoints(arrays: dict[str, np.ndarray], told: Description) -> None:
+    told.fact("key-points", shortened([str(n) for n in arrays["names"]]))
+
+
+def _stages(run: Run, told: Description) -> None:
+    for name, timing in run.read_timings().items():
+        told.fact(f"time of {name}", f"{timing['seconds']:.1f} s, {timing['items_per_second']:.2f} items/s")
+    for file in sorted((run.path / ".stages").glob("*.json")):
+        try:
+            done = json.loads(file.read_text())["done"]
+        except (OSError, ValueError, KeyError):
+            done = False
+        if not done:
+            told.problem(f"stage {file.stem} isn't finished; start the run again and it goes on")
+    for left in run.path.rglob(".*.tmp.*"):
+        told.problem(f"{left.relative_to(run.path)} was left by a killed run; it may be deleted")
