@@ -245,6 +245,27 @@ def labelled_errors(points: np.ndarray, labels: np.ndarray, moments: np.ndarray)
     return errors
 
 
+@njit(cache=True, nogil=True)
+def union_errors(
+    points: np.ndarray, begin: np.ndarray, end: np.ndarray, union: np.ndarray, moments: np.ndarray
+) -> np.ndarray:
+    """Equivalent error lengths of unions of ranges of points, as `labelled_errors` but faster.
+
+    Range k is points[begin[k]:end[k]] and part of union[k]; `moments` are those of the unions.
+    """
+    count = moments.shape[0]
+    variances = np.ones((count, 3))
+    axes = np.zeros((count, 3, 3))
+    all_axes(moments, variances, axes)
+    errors = np.zeros(count)
+    for k in range(union.shape[0]):
+        u = union[k]
+        errors[u] += error_terms(points, begin[k], end[k], moments[u], variances[u], axes[u])
+    for u in range(count):
+        errors[u] = equivalent_length(errors[u] / moments[u, 0])
+    return errors
+
+
 def from_moments(moments: np.ndarray, errors: np.ndarray, origin: np.ndarray, spacing: float) -> Ellipsoids:
     """Ellipsoids of sets of moments in grid units.
 

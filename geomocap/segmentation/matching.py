@@ -13,12 +13,13 @@ from scipy.spatial.distance import cdist
 
 from geomocap.errors import GeometryError
 from geomocap.segmentation.contacts import count_contacts
-from geomocap.segmentation.ellipsoids import Ellipsoids, from_moments, labelled_errors
+from geomocap.segmentation.ellipsoids import Ellipsoids, from_moments, union_errors
 from geomocap.segmentation.merging import merge_frame
 from geomocap.segmentation.settings import SegmentationSettings
 from geomocap.segmentation.splitting import SplitFrame, split_points
 
 _CANDIDATES = 16
+_CONTACTS_EVERY = 4
 
 
 @dataclass(frozen=True)
@@ -32,9 +33,9 @@ class Paths:
     labels : tuple of (N_t,) int16
         Ellipsoid of every point of every frame.
     contacts : (K, K) float
-        Neighbouring pairs of points between two ellipsoids, mean over the frames.
+        Neighbouring pairs of points between two ellipsoids, mean over every fourth frame.
     touching : (K, K) float
-        Share of the frames in which two ellipsoids touch.
+        Share of every fourth frame in which two ellipsoids touch.
     repaired : (T,) int32
         Ellipsoids that were split because several were matched to them; 0 in the first frame.
     """
@@ -211,8 +212,8 @@ class MatchedFrame:
         Ellipsoid of each point, in the order in which the points were given.
     moments : (K, 10) float, grid units
     errors : (K,) float, grid units
-    contacts : (K, K) int32
-        Neighbouring pairs of points between two ellipsoids.
+    contacts : (K, K) int32, optional
+        Neighbouring pairs of points between two ellipsoids, if they were counted.
     repaired : int
         Sets that were cut because several ellipsoids had been matched to them.
     origin : (3,) float, metres, world
@@ -222,7 +223,7 @@ class MatchedFrame:
     labels: np.ndarray
     moments: np.ndarray
     errors: np.ndarray
-    contacts: np.ndarray
+    contacts: np.ndarray | None
     repaired: int
     origin: np.ndarray
     spacing: float
@@ -238,7 +239,9 @@ class MatchedFrame:
         return self.origin / self.spacing + self.moments[:, 1:4] / self.moments[:, :1]
 
     @classmethod
-    def of(cls, split: SplitFrame, sets: _Sets, partner: np.ndarray, count: int, repaired: int) -> MatchedFrame:
+    def of(
+        cls, split: SplitFrame, sets: _Sets, partner: np.ndarray, count: int, repaired: int, touch: bool
+    ) -> MatchedFrame:
         """Unite the sets of each partner."""
         ordered = sets.labels(partner)
         moments = np.zeros((count, 10))
@@ -248,8 +251,8 @@ class MatchedFrame:
         return cls(
             labels,
             moments,
-            labelled_errors(sets.points, ordered, moments),
-            count_contacts(sets.points, ordered, count),
+            union_errors(sets.points, sets.begin, sets.end, partner, moments),
+            count_contacts(sets.points, ordered, count) if touch else None,
             repaired,
             split.origin,
             split.spacing,
@@ -259,11 +262,11 @@ class MatchedFrame:
 def first_frame(split: SplitFrame, settings: SegmentationSettings) -> MatchedFrame:
     """Merge the first frame (section 5.2.2); the number of its ellipsoids is that of the sequence."""
     merged = merge_frame(split, settings.merge_error)
-    return MatchedFrame.of(split, _Sets(split, 0), merged, int(merged.max()) + 1, 0)
+    return MatchedFrame.of(split, _Sets(split, 0), merged, int(merged.max()) + 1, 0, True)
 
 
 def match_frame(
-    before: MatchedFrame, split: SplitFrame, settings: SegmentationSettings, frame: int = 0
+    before: MatchedFrame, split: SplitFrame, settings: SegmentationSettings, frame: int = 0, touch: bool = True
 ) -> MatchedFrame:
     """Match the K ellipsoids of a frame to the leaves of the next, and make these K as well (section 6, figure 3).
 
@@ -276,6 +279,8 @@ def match_frame(
     settings : SegmentationSettings
     frame : int
         Number of frame t + 1, for errors.
+    touch : bool
+        Whether to count contacts.
 
     Returns
     -------
@@ -318,7 +323,7 @@ def match_frame(
     # Missing correspondences: merge the ellipsoid into the nearest matched one
     partner = cdist(new, new[target]).argmin(axis=1).astype(np.int32)
     partner[target] = np.arange(count)
-    return MatchedFrame.of(split, sets, partner, count, repaired)
+    return MatchedFrame.of(split, sets, partner, count, repaired, touch)
 
 
 def _cheapest(cost: np.ndarray, number: int) -> np.ndarray:
@@ -347,21 +352,24 @@ def match_frames(splits: Iterable[SplitFrame], settings: SegmentationSettings) -
     for number, split in enumerate(splits):
         if current is None:
             current = first_frame(split, settings)
-            contacts = np.zeros(current.contacts.shape)
-            touching = np.zeros(current.contacts.shape)
+            looks = 0
+            contacts = np.zeros((len(current.moments),) * 2)
+            touching = np.zeros(contacts.shape)
         else:
-            current = match_frame(current, split, settings, number)
+            current = match_frame(current, split, settings, number, number % _CONTACTS_EVERY == 0)
         frames.append(current.ellipsoids)
         labels.append(current.labels)
         repaired.append(current.repaired)
-        contacts += current.contacts
-        touching += current.contacts > 0
+        if current.contacts is not None:
+            looks += 1
+            contacts += current.contacts
+            touching += current.contacts > 0
     if current is None:
         raise GeometryError("no frames to segment; the capture or the folder of scans is empty")
     return Paths(
         Ellipsoids.stack(frames),
         tuple(labels),
-        contacts / len(frames),
-        touching / len(frames),
+        contacts / looks,
+        touching / looks,
         np.array(repaired, np.int32),
     )

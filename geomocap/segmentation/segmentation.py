@@ -29,9 +29,9 @@ class Segmentation:
     body_rotations : (T, B, 3, 3) float
         Rotation since frame 0, world axes.
     contacts : (B, B) float
-        Neighbouring pairs of points between two bodies, mean over the frames.
+        Neighbouring pairs of points between two bodies, mean over the frames looked at.
     touching : (B, B) float
-        Share of the frames in which two bodies touch.
+        Share of the frames looked at in which two bodies touch.
     seeds : (B,) int32
         Ellipsoid from which each body was found.
     integrals : (K, K) float, metres

@@ -204,6 +204,8 @@ def test_count_is_constant_under_planted_duplicates_and_missing(coherence):
     count = paths.ellipsoids.counts.shape[1]
     assert paths.ellipsoids.centers.shape == (6, count, 3)
     assert count == 16
+    last = fit_ellipsoids(figure(seed=5, count=500) + np.array([0.1, 0, 0]), paths.labels[-1].astype(int), count, 0.02)
+    np.testing.assert_allclose(paths.ellipsoids.errors[-1], last.errors, rtol=1e-6)
     assert paths.repaired[3] >= 14
     for labels, counts in zip(paths.labels, paths.ellipsoids.counts, strict=True):
         np.testing.assert_array_equal(np.bincount(labels, minlength=count), counts)
