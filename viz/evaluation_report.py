@@ -116,7 +116,7 @@ def curve_plots(curves: Sequence[Curve]) -> Figure:
         ax.axhline(float(np.mean(curve.values)), color=MUTED, ls="--", lw=0.9)
         ax.set_title(f"{curve.name} ({curve.unit})" if curve.unit != "1" else curve.name)
         ax.set_xlabel("frame")
-        ax.set_ylim(bottom=min(0.0, float(curve.values.min())))
+        _span(ax, [curve])
     for ax in axes[len(curves) :]:
         ax.set_axis_off()
     return figure
@@ -131,7 +131,7 @@ def together(curves: Sequence[Curve]) -> Figure:
         ax.plot(curve.frames, curve.values, color=hex_color(body_color(k)), label=curve.name, lw=1.0)
     ax.set_xlabel("frame")
     ax.set_title(f"error ({curves[0].unit})")
-    ax.set_ylim(bottom=0)
+    _span(ax, curves)
     ax.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize=7)
     return figure
 
@@ -180,11 +180,11 @@ def _side_axes(vertices: np.ndarray) -> tuple[int, int]:
 @plot
 def body_errors(frame: LabelledFrame, truth: Truth, number: int) -> Figure:
     """Draw found and true bodies and the distances from the true surface, seen from the side."""
-    figure = Figure(figsize=(9.6, 4.4), dpi=140, layout="constrained")
+    figure = Figure(figsize=(9.6, 5.6), dpi=140, layout="constrained")
     axes = figure.subplots(1, 3, sharex=True, sharey=True)
     across, up = _side_axes(truth.vertices[number])
     order = np.argsort(frame.points[:, 1 - across] * (1 if across == 1 else -1))
-    p, size = frame.points[order], 300.0 / np.sqrt(max(len(order), 1)) / 4
+    p, size = frame.points[order], 400.0 / np.sqrt(max(len(order), 1)) / 4
     for ax, labels, title in ((axes[0], frame.found, "found"), (axes[1], frame.true, "true")):
         colors = np.array([body_color(int(b)) for b in labels[order]]) / 255
         ax.scatter(p[:, across], p[:, up], s=size, c=colors, linewidths=0)
@@ -192,7 +192,7 @@ def body_errors(frame: LabelledFrame, truth: Truth, number: int) -> Figure:
     distance = 1000 * frame.distance[order]
     top = max(float(np.percentile(distance, 95)), 1.0)
     shown = axes[2].scatter(p[:, across], p[:, up], s=size, c=distance, cmap="magma_r", vmin=0, vmax=top, linewidths=0)
-    axes[2].set_title("distance from the true surface (mm)")
+    axes[2].set_title("distance from the surface (mm)")
     figure.colorbar(shown, ax=axes[2], shrink=0.7)
     for ax in axes:
         _metric(ax, across)
@@ -202,7 +202,7 @@ def body_errors(frame: LabelledFrame, truth: Truth, number: int) -> Figure:
 @plot
 def joint_errors(result: Evaluation, skeleton: dict[str, np.ndarray], truth: Truth, frame: int) -> Figure:
     """Draw matched joints, found and true, over the true surface of a frame, from two sides."""
-    figure = Figure(figsize=(9.6, 4.8), dpi=140, layout="constrained")
+    figure = Figure(figsize=(9.6, 5.6), dpi=140, layout="constrained")
     found = {str(n): p for n, p in zip(skeleton["joint_names"], skeleton["joint_positions"][frame], strict=True)}
     true = {str(n): p for n, p in zip(truth.joint_names, truth.joint_positions[frame], strict=True)}
     pairs = [(found[m.found], true[m.true]) for m in result.matches if m.found in found and m.true in true]
@@ -219,6 +219,12 @@ def joint_errors(result: Evaluation, skeleton: dict[str, np.ndarray], truth: Tru
         ax.scatter(alone[:, across], alone[:, 2], s=16, color=MUTED, marker="x", linewidths=1.0)
         _metric(ax, across)
     return figure
+
+
+def _span(ax: Axes, curves: Sequence[Curve]) -> None:
+    """Show errors from zero on, and don't magnify what is next to nothing."""
+    values = np.concatenate([c.values for c in curves])
+    ax.set_ylim(min(0.0, float(values.min())), 1.1 * max(float(values.max()), 1.0))
 
 
 def _metric(ax: Axes, across: int) -> None:

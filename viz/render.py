@@ -84,7 +84,7 @@ def _surfaces(meshes: Sequence[Mesh]) -> _Surfaces | None:
     starts = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
     faces = np.concatenate([m.faces + s for m, s in zip(meshes, starts, strict=True)])
     sizes = [len(m.faces) for m in meshes]
-    scene = o3d.t.geometry.RaycastingScene()
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)  # frames are rendered side by side
     vertices = np.concatenate([m.vertices for m in meshes]).astype(np.float32)
     scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(faces.astype(np.uint32)))
     return _Surfaces(

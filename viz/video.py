@@ -7,6 +7,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 
 from geomocap.errors import RunError
@@ -41,12 +42,15 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, quality: i
                     container = av.open(str(target), "w", format="mp4", options={"movflags": "+faststart"})
                     stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
                     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-                    stream.options = {"crf": str(quality), "preset": "medium", "threads": "1"}
+                    # Macroblock trees make x264's output depend on what the memory held before; so do threads.
+                    stream.options = {"crf": str(quality), "preset": "medium", "x264-params": "mbtree=0"}
+                    stream.codec_context.thread_count = 1
                 if (height, width) != frame.shape[:2]:
                     padding = ((0, height - frame.shape[0]), (0, width - frame.shape[1]), (0, 0))
                     frame = np.pad(frame, padding, constant_values=255)
-                picture_ = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
-                container.mux(stream.encode(picture_))
+                rgb = np.ascontiguousarray(frame)
+                planes = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV_I420), np.uint8)  # repeats, unlike swscale
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(planes, format="yuv420p")))
             if container is None or stream is None:
                 raise RunError(f"{path}: no frames for a video")
             container.mux(stream.encode())

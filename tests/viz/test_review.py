@@ -16,12 +16,14 @@ from geomocap.errors import GeometryError, RunError
 from geomocap.run import Run
 from tests.viz.conftest import LIMBS, Made
 from viz import render_file, review
+from viz.drawing import write_png
+from viz.figures import joint_angles
 from viz.quality import assess, coverage, relative_paths
 from viz.report import Block, Report, Section, render_html, table, video
 from viz.results import Results, ply_count, read_points
 from viz.scene import stage
-from viz.sheets import overlay
-from viz.video import best_camera, write_video
+from viz.sheets import overlay, path_sheet
+from viz.video import best_camera, motion_video, write_video
 
 
 @pytest.fixture(scope="session")
@@ -73,11 +75,15 @@ def test_report_is_one_self_contained_page(reviewed: list[Path]) -> None:
     assert "The run has no" not in page
 
 
-def test_review_repeats_to_the_bit(made: Made, reviewed: list[Path]) -> None:
-    before = {f.name: f.read_bytes() for f in reviewed}
-    again = review(made.run, made.capture, frames=[0, 5])
-    assert {f.name for f in again} == set(before)
-    assert [f.name for f in again if f.read_bytes() != before[f.name]] == []
+def test_pictures_repeat_to_the_bit(made: Made, reviewed: list[Path], tmp_path: Path) -> None:
+    results = Results(made.run, made.capture)
+    place = stage(results)
+    motion_video(results, place, tmp_path / "motion.mp4")
+    assert (tmp_path / "motion.mp4").read_bytes() == (made.run.path / "review" / "motion.mp4").read_bytes()
+    write_png(tmp_path / "paths.png", path_sheet(results, place, 0))
+    assert (tmp_path / "paths.png").read_bytes() == (made.run.path / "review" / "paths.png").read_bytes()
+    assert results.skeleton is not None
+    assert joint_angles(results.skeleton, 30.0) == (made.run.path / "review" / "joint_angles.png").read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -94,7 +100,7 @@ def test_missing_parts_are_named_and_left_out(made: Made, tmp_path: Path, kept: 
         source = made.run.path / name
         if source.is_dir():
             shutil.copytree(source, tmp_path / "run" / name)
-            for late in (tmp_path / "run" / name).rglob("00000[2-5].*"):
+            for late in (tmp_path / "run" / name).rglob("00000[1-5].*"):
                 late.unlink()
         else:
             (tmp_path / "run").mkdir(exist_ok=True)
@@ -164,7 +170,7 @@ def test_overlay_lies_on_the_photographed_figure(made: Made) -> None:
 
 def test_quality_of_the_figure(made: Made) -> None:
     quality = assess(Results(made.run, made.capture), [0, 3])
-    assert all(covered > 0.95 for covered, _ in quality.agreement.values())
+    assert all(covered > 0.8 for covered, _ in quality.agreement.values())
     assert max(b.spread for b in quality.bones) < 1e-9
     assert quality.unassigned == pytest.approx(1 / 97, rel=0.1)
     assert not [w for w in quality.warnings if "bones" in w or "joints" in w]
