@@ -159,6 +159,8 @@ class Adjusted:
         Sum of squared normalised residuals of image coordinates, lengths and priors.
     iterations : int
     converged : bool
+    loss : float
+        Scale of the pseudo-Huber loss that was used; 0 for least squares.
     """
 
     network: Network
@@ -167,6 +169,7 @@ class Adjusted:
     cost: float
     iterations: int
     converged: bool
+    loss: float = 0.0
 
     @property
     def residuals(self) -> np.ndarray:
@@ -344,7 +347,7 @@ def adjust(
         converged = normal.cost - trial.cost <= tolerance * normal.cost
         network, normal = candidate, trial
         damping = max(damping / 10, 1e-9)
-    return Adjusted(network, columns, prior, normal.cost, iteration, converged)
+    return Adjusted(network, columns, prior, normal.cost, iteration, converged, loss)
 
 
 def _stepped(network: Network, columns: Columns, step: np.ndarray, bar_step: np.ndarray) -> Network:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -140,8 +140,8 @@ class Calibration:
 
     @property
     def sigma0(self) -> float:
-        """A-posteriori standard deviation of unit weight."""
-        return self.adjusted.sigma0
+        """A-posteriori standard deviation of unit weight, for the targets' a-priori standard deviations."""
+        return self.adjusted.sigma0 * self.estimate.sigma_factor
 
     def reconstruction(self) -> pycolmap.Reconstruction:
         """Return a COLMAP model: one image `<camera>/000000.png` a camera, the bar ends as points with tracks."""
@@ -303,14 +303,7 @@ def calibrate_bar(
     adjusted, tests = choose_model(found, prior, settings)
     progress("calibrate", 3, steps)
     datum = world.datum(adjusted, found.target_radius)
-    adjusted = Adjusted(
-        datum.apply(adjusted.network),
-        adjusted.columns,
-        adjusted.prior,
-        adjusted.cost,
-        adjusted.iterations,
-        adjusted.converged,
-    )
+    adjusted = replace(adjusted, network=datum.apply(adjusted.network))
     cov = covariance(adjusted)
     lengths = held_out(adjusted, settings.folds)
     progress("calibrate", 4, steps)

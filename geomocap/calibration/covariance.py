@@ -50,7 +50,7 @@ def covariance(adjusted: Adjusted) -> Covariance:
     """
     network, columns = adjusted.network, adjusted.columns
     groups = Groups.of(network)
-    normal = normal_equations(network, columns, groups, adjusted.prior)
+    normal = normal_equations(network, columns, groups, adjusted.prior, adjusted.loss)
     reduced, _, inverse = reduced_system(normal, columns, groups, network.n_views, 0.0)
     cameras, points = datum_directions(network, columns)
     scale = 1.0 / np.sqrt(np.diag(normal.U))

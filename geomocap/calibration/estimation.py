@@ -15,7 +15,7 @@ from geomocap.calibration.network import Network
 from geomocap.calibration.projection import INTERIOR_NAMES
 from geomocap.calibration.settings import BarSettings
 from geomocap.calibration.sightings import Sightings
-from geomocap.calibration.stability import resect, split_view, sudden_loss, sudden_shift, test_split
+from geomocap.calibration.stability import refined_changes, resect, split_view, sudden_loss, sudden_shift, test_split
 from geomocap.errors import CalibrationError
 
 
@@ -34,6 +34,8 @@ class Estimate:
         View of each camera in each frame.
     target_radius : float
         Radius of the balls for which image centres were corrected, metres; 0 without correction.
+    sigma_factor : float
+        By how much the targets' a-priori standard deviations had to be enlarged.
     """
 
     adjusted: Adjusted
@@ -41,6 +43,7 @@ class Estimate:
     rejected: np.ndarray
     view_of: np.ndarray
     target_radius: float
+    sigma_factor: float
 
 
 @dataclass(frozen=True)
@@ -108,6 +111,10 @@ def estimate(
         spread = 1.4826 * float(np.median(np.abs(rough.residuals)))
         limit = np.minimum(np.maximum(8 * spread, 1.0), share * side)
         chosen = identify(sightings, rough.network.interior, poses_of(rough.network), length, limit, view_of=view_of)
+        found = _found_again(sightings, chosen, rough.network, view_of, 0.015 * side, settings.seed)
+        if found is not None:
+            rough = replace(rough, network=found)
+            chosen = identify(sightings, found.interior, poses_of(found), length, limit, view_of=view_of)
         rough = _relabelled(sightings, chosen, rough, spread, free, prior, view_of)
         change = sudden_loss(sightings, chosen, view_of)
         if change is not None:
@@ -122,9 +129,10 @@ def estimate(
             split = test_split(rough, view_of, sightings.frames, change, prior, loss=2.0)
             if split is not None:
                 rough, view_of = split
+    view_of = refined_changes(rough.network, sightings, view_of, limit)
     chosen = identify(sightings, rough.network.interior, poses_of(rough.network), length, limit, view_of=view_of)
     network = _network(sightings, chosen, rough.network, 0.0, length_sigma, view_of)
-    final = clean(network, free, prior, settings)
+    final, factor = clean(network, free, prior, settings)
     radius = 0.0
     radii = observed_radii(final.network, sightings, chosen)
     if settings.targets.shape == "sphere" and np.all(radii > 0):
@@ -133,11 +141,18 @@ def estimate(
         n = network.with_state(final.network.interior, final.network.rotation, final.network.translation, network.bars)
         n = _network(sightings, chosen, n, 0.0, length_sigma, view_of)
         n = replace(n, pixels=n.pixels - shifts(n, radius))
-        final = clean(n, free, prior, settings)
+        final, factor = clean(n, free, prior, settings)
     kept = np.zeros(chosen.shape, dtype=bool)
     n = final.network
+    for v, c in enumerate(n.view_camera):
+        bars = len(np.unique(n.bar[n.view == v]))
+        if bars < 5:
+            raise CalibrationError(
+                f"camera {n.names[c]}: only {bars} bar positions fit the other cameras; check its synchronization, and "
+                "record more positions where it and two others see the bar"
+            )
     kept[n.view_camera[n.view], _times(n, sightings), n.end] = True
-    return Estimate(final, chosen, (chosen >= 0) & ~kept, view_of, radius)
+    return Estimate(final, chosen, (chosen >= 0) & ~kept, view_of, radius, factor)
 
 
 def _network(
@@ -168,6 +183,42 @@ def _relabelled(
     return adjust(network, free, prior, loss=2.0, max_iterations=40, tolerance=1e-5)
 
 
+def _found_again(
+    sightings: Sightings,
+    chosen: np.ndarray,
+    network: Network,
+    view_of: np.ndarray,
+    limit: np.ndarray,
+    seed: int,
+) -> Network | None:
+    """Give new poses to cameras that fit few of the bars, found from the bars that the others know.
+
+    A camera that was chained wrongly can't mend itself; its interior orientation starts again from the others' as well.
+    """
+    fits = (chosen >= 0).any(axis=2)
+    checkable = (sightings.counts >= 2) & (fits.sum(axis=0) - fits >= 2)
+    rate = (checkable & fits).sum(axis=1) / np.maximum(checkable.sum(axis=1), 1)
+    lost = [c for c in range(len(rate)) if rate[c] < 0.75 and view_of[c].min() == view_of[c].max()]
+    side = network.sizes.max(axis=1)
+    others = [c for c in range(len(rate)) if c not in lost]
+    if not lost or len(others) < 2:
+        return None
+    interior, rotation, translation = network.interior.copy(), network.rotation.copy(), network.translation.copy()
+    changed = False
+    for c in lost:
+        trial = interior.copy()
+        trial[c] = np.median(interior[others], axis=0)
+        trial[c, :2] = side[c] * np.median(interior[others, :2] / side[others, None])
+        trial[c, 2:4] = network.sizes[c] / 2
+        rng = np.random.default_rng((seed, c))
+        known = replace(network, interior=trial)
+        pose = resect(known, sightings, c, np.flatnonzero(checkable[c]), float(limit[c]), rng, 0.35)
+        if pose is not None:
+            interior[c], rotation[c], translation[c] = trial[c], pose[:, :3], pose[:, 3]
+            changed = True
+    return replace(network, interior=interior, rotation=rotation, translation=translation) if changed else None
+
+
 def _with_new_pose(
     sightings: Sightings,
     chosen: np.ndarray,
@@ -196,19 +247,25 @@ def _with_new_pose(
     return split, replace(n, view_camera=np.r_[n.view_camera, camera], rotation=rotation, translation=translation)
 
 
-def clean(network: Network, free: tuple[int, ...], prior: Prior, settings: BarSettings) -> Adjusted:
-    """Adjust robustly, then by least squares without outliers until their set stays."""
+def clean(network: Network, free: tuple[int, ...], prior: Prior, settings: BarSettings) -> tuple[Adjusted, float]:
+    """Adjust robustly, then by least squares without outliers until their set stays.
+
+    Where the residuals are well beyond what the targets' precision lets expect (cameras not quite synchronized, say),
+    errors are not normal and outliers have no clear limit: standard deviations are enlarged then, and the final
+    adjustment stays robust.
+
+    Returns
+    -------
+    adjusted : Adjusted
+    factor : float
+        By how much the standard deviations of image points were enlarged.
+    """
+    begin = network
     everything = adjust(network, free, prior, loss=3.0, max_iterations=40, tolerance=1e-6)
     network = everything.network
     result = everything
     for _ in range(5):
-        error = np.linalg.norm(result.residuals / network.sigmas[:, None], axis=1)
-        # Residuals are smaller than errors by the share of the observations that checks the others
-        share = np.sqrt((2 * len(network.bar) + len(network.bars)) / max(result.redundancy, 1))
-        scale = max(scale_of(network, result.residuals), 0.5) * max(0.9 * share, 1.0)
-        bad = error > settings.outlier_threshold * scale
-        lengths = np.linalg.norm(network.bars[:, 0] - network.bars[:, 1], axis=1) - network.length
-        bad |= (np.abs(lengths) > settings.outlier_threshold * scale * network.length_sigma)[network.bar]
+        bad = _outliers(result, settings.outlier_threshold)
         if result is not everything and not bad.any():
             break
         if bad.mean() > 0.5:
@@ -219,7 +276,25 @@ def clean(network: Network, free: tuple[int, ...], prior: Prior, settings: BarSe
         network = network.with_observations(~bad)
         result = adjust(network, free, prior)
         network = result.network
-    return result
+    factor = 1.0
+    if result.sigma0 > 1.5:
+        factor = 1.2 * result.sigma0  # of the cleaned observations; the tails come back in
+        wide = replace(everything.network, sigmas=begin.sigmas * factor)
+        result = adjust(wide, free, prior, loss=2.0)
+        wide = result.network.with_observations(~_outliers(result, 1.5 * settings.outlier_threshold))
+        result = adjust(wide, free, prior, loss=2.0)
+    return result, factor
+
+
+def _outliers(adjusted: Adjusted, threshold: float) -> np.ndarray:
+    """Observations (M,) bool beyond so many standard deviations, and all of bars whose length is."""
+    network = adjusted.network
+    # Residuals are smaller than errors by the share of the observations that checks the others
+    share = np.sqrt((2 * len(network.bar) + len(network.bars)) / max(adjusted.redundancy, 1))
+    scale = max(scale_of(network, adjusted.residuals), 0.5) * max(0.9 * share, 1.0)
+    bad = np.linalg.norm(adjusted.residuals / network.sigmas[:, None], axis=1) > threshold * scale
+    lengths = np.linalg.norm(network.bars[:, 0] - network.bars[:, 1], axis=1) - network.length
+    return bad | (np.abs(lengths) > threshold * scale * network.length_sigma)[network.bar]
 
 
 def _times(network: Network, sightings: Sightings) -> np.ndarray:
@@ -237,12 +312,11 @@ def choose_model(estimate: Estimate, prior: Prior, settings: BarSettings) -> tup
     if not free:
         return adjusted, ()
     names = adjusted.network.names
-    loose = Prior(prior.mean, prior.sigma.copy(), prior.aspect_sigma)
     extra = interior_indices(("k3", "shear")) if settings.model != "FULL_OPENCV" else interior_indices(("shear",))
-    wide = adjust(adjusted.network, tuple(sorted({*free, *extra})), loose)
+    wide = adjust(adjusted.network, tuple(sorted({*free, *extra})), prior, adjusted.loss)
     tests = tests_of(wide, extra)
     if settings.model == "auto":
-        with_k3 = adjust(adjusted.network, (*free, *interior_indices(("k3",))), loose)
+        with_k3 = adjust(adjusted.network, (*free, *interior_indices(("k3",))), prior, adjusted.loss)
         gain = (adjusted.cost - with_k3.cost) / with_k3.sigma0**2
         # Each camera's k3 must earn its place against the number of observations (Schwarz's criterion)
         if gain > len(names) * np.log(2 * len(adjusted.network.bar)) and _effect(with_k3, adjusted) > 0.05:

@@ -95,7 +95,7 @@ def read_observed(path: Path) -> Observed:
 
 def sightings_of(
     observed: Observed,
-    pair: tuple[str, str] | None = None,
+    pairs: Sequence[tuple[str, str]] | None = None,
     sizes: Mapping[str, tuple[int, int]] | None = None,
     sigma: float = 0.2,
     cameras: Sequence[str] | None = None,
@@ -105,8 +105,9 @@ def sightings_of(
     Parameters
     ----------
     observed : Observed
-    pair : (str, str), optional
-        Names of the two points; the only two of the table if not given.
+    pairs : sequence of (str, str), optional
+        Names of the two points; the only two of the table if not given. Several pairs the same distance apart (both
+        diagonals of a board, say) count as bar positions of their own: their frame numbers go on from the first's.
     sizes : mapping of camera name to (width, height), optional
         Image sizes; without them the smallest common size that holds all observations is taken.
     sigma : float
@@ -120,29 +121,31 @@ def sightings_of(
         If the points are not there, or observations lie outside the images.
     """
     names = tuple(np.unique(observed.points))
-    if pair is None:
+    if pairs is None:
         if len(names) != 2:
             shown = ", ".join(names[:12])
             raise CalibrationError(f"the table has {len(names)} points ({shown}); say which two are the bar's ends")
-        pair = (names[0], names[1])
-    for name in pair:
+        pairs = [(names[0], names[1])]
+    for name in (n for pair in pairs for n in pair):
         if name not in names:
             raise CalibrationError(f"the table has no point {name}; it has {', '.join(names[:12])}")
     wanted = tuple(cameras) if cameras is not None else tuple(sorted(np.unique(observed.cameras)))
-    rows = np.flatnonzero(np.isin(observed.points, pair) & np.isin(observed.cameras, wanted))
-    frames = np.unique(observed.frames[rows])
+    stride = int(observed.frames.max()) + 1
     found: dict[tuple[int, int], np.ndarray] = {}
     for c, camera in enumerate(wanted):
-        own = rows[observed.cameras[rows] == camera]
-        if not len(own):
-            raise CalibrationError(f"camera {camera}: the table has no observation of {pair[0]} or {pair[1]}")
-        for t in np.unique(observed.frames[own]):
-            at = own[observed.frames[own] == t]
-            at = at[np.argsort(observed.points[at] != pair[0], kind="stable")]
-            s = np.where(np.isfinite(observed.sigmas[at]), observed.sigmas[at], sigma)
-            key = (c, int(np.searchsorted(frames, t)))
-            found[key] = np.column_stack([observed.pixels[at], s, np.zeros(len(at))])
-    return stack_candidates(wanted, _sizes(observed, wanted, sizes), frames, found)
+        of_camera = observed.cameras == camera
+        for k, pair in enumerate(pairs):
+            own = np.flatnonzero(of_camera & np.isin(observed.points, pair))
+            for t in np.unique(observed.frames[own]):
+                at = own[observed.frames[own] == t]
+                at = at[np.argsort(observed.points[at] != pair[0], kind="stable")]
+                s = np.where(np.isfinite(observed.sigmas[at]), observed.sigmas[at], sigma)
+                found[c, int(t) + k * stride] = np.column_stack([observed.pixels[at], s, np.zeros(len(at))])
+        if not any(key[0] == c for key in found):
+            raise CalibrationError(f"camera {camera}: the table has no observation of the bar's ends")
+    frames = np.unique([t for _, t in found])
+    indexed = {(c, int(np.searchsorted(frames, t))): values for (c, t), values in found.items()}
+    return stack_candidates(wanted, _sizes(observed, wanted, sizes), frames, indexed)
 
 
 def _sizes(observed: Observed, cameras: tuple[str, ...], sizes: Mapping[str, tuple[int, int]] | None) -> np.ndarray:

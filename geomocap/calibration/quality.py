@@ -95,7 +95,9 @@ def held_out(adjusted: Adjusted, folds: int) -> HeldOut:
         if not test.any() or test.all():
             continue
         try:
-            fit = adjust(network.with_bars(~test), adjusted.columns.free_interior, adjusted.prior, tolerance=1e-8)
+            fit = adjust(
+                network.with_bars(~test), adjusted.columns.free_interior, adjusted.prior, adjusted.loss, tolerance=1e-8
+            )
         except CalibrationError:
             continue
         unseen = network.with_bars(test)

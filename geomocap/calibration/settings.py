@@ -47,10 +47,10 @@ class BarSettings(Settings):
     focal_sigma: float = Field(0.5, gt=0, description="a-priori standard deviation of the camera constant (fraction)")
     aspect_sigma: float = Field(0.01, gt=0, description="a-priori standard deviation of fx − fy (fraction of fx)")
     principal_point_sigma: float = Field(
-        0.05, gt=0, description="a-priori standard deviation of the principal point (fraction of the longer side)"
+        0.03, gt=0, description="a-priori standard deviation of the principal point (fraction of the longer side)"
     )
-    radial_sigma: float = Field(0.5, gt=0, description="a-priori standard deviation of radial coefficients")
-    tangential_sigma: float = Field(0.01, gt=0, description="a-priori standard deviation of decentering coefficients")
+    radial_sigma: float = Field(0.3, gt=0, description="a-priori standard deviation of radial coefficients")
+    tangential_sigma: float = Field(0.003, gt=0, description="a-priori standard deviation of decentering coefficients")
     pairing_threshold: float = Field(
         0.015,
         gt=0,

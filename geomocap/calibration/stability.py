@@ -135,6 +135,49 @@ def sudden_shift(adjusted: Adjusted, view_of: np.ndarray, frames: np.ndarray) ->
     return best[1], best[2]
 
 
+def refined_changes(network: Network, sightings: Sightings, view_of: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """Move each change of a camera's pose to the frame that explains its targets best.
+
+    Parameters
+    ----------
+    view_of : (C, T) int
+    limit : (C,) float
+        Errors beyond this count no more, pixels.
+
+    Returns
+    -------
+    view_of : (C, T) int
+    """
+    out = view_of.copy()
+    time = np.searchsorted(sightings.frames, network.frames)
+    J = np.empty((2, 22))
+    xy = np.empty(2)
+    for c in range(len(view_of)):
+        views = [int(view_of[c, 0]), int(view_of[c, -1])]
+        if views[0] == views[1]:
+            continue
+        cost = np.zeros((2, len(sightings.frames)))
+        for p, t in enumerate(time):
+            targets = sightings.pixels[c, t]
+            if np.isfinite(targets[:, 0]).sum() < 2:
+                continue
+            for k, v in enumerate(views):
+                for end in network.bars[p]:
+                    near = np.inf
+                    if project_point(network.interior[c], network.rotation[v], network.translation[v], end, xy, J):
+                        near = float(np.nanmin(((targets - xy) ** 2).sum(axis=1)))
+                    cost[k, t] += min(near, limit[c] ** 2)
+        before = np.r_[0.0, np.cumsum(cost[0])]
+        after = np.r_[np.cumsum(cost[1][::-1])[::-1], 0.0]
+        total = before + after
+        old = int(np.flatnonzero(np.diff(view_of[c]))[0]) + 1
+        best = int(np.flatnonzero(total <= total.min() * (1 + 1e-9))[0])
+        start = best if total[best] < total[old] else old
+        if LEAST <= start <= len(sightings.frames) - LEAST:
+            out[c] = np.where(np.arange(len(out[c])) < start, views[0], views[1])
+    return out
+
+
 def split_view(view_of: np.ndarray, camera: int, start: int, n_views: int) -> np.ndarray:
     """Give a camera a new view from frame index `start` on."""
     out = view_of.copy()
@@ -176,7 +219,13 @@ def test_split(
 
 
 def resect(
-    network: Network, sightings: Sightings, camera: int, frames: np.ndarray, limit: float, rng: np.random.Generator
+    network: Network,
+    sightings: Sightings,
+    camera: int,
+    frames: np.ndarray,
+    limit: float,
+    rng: np.random.Generator,
+    least_share: float = 0.4,
 ) -> np.ndarray | None:
     """Find the pose of a camera from bars that the others know, the ends not told apart.
 
@@ -189,6 +238,8 @@ def resect(
         Indices of the frames to use.
     limit : float
         Largest error of a fitting target, pixels.
+    least_share : float
+        Share of the frames that must fit.
 
     Returns
     -------
@@ -233,7 +284,7 @@ def resect(
                 best = (count, pose)
         if best is not None and best[0] > 0.9 * len(usable):
             break
-    if best is None or best[0] < max(LEAST, 0.4 * len(usable)):
+    if best is None or best[0] < max(LEAST, least_share * len(usable)):
         return None
     pose = best[1]
     for _ in range(3):
