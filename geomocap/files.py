@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from geomocap.errors import RunError
@@ -27,7 +28,8 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
             raise OSError("nothing was written; is the disk full?")
         os.replace(temporary, path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
         raise RunError(
             f"{path}: can't be written ({error.strerror or error}); free space or choose another folder"
         ) from None

@@ -10,14 +10,17 @@ import typer
 import geomocap
 from geomocap import pipeline
 from geomocap.cli import captures
+from geomocap.cli.evaluate import evaluate
 from geomocap.cli.execution import Scheduler, Workers
 from geomocap.cli.export import export
+from geomocap.cli.info import info
 from geomocap.cli.jobs import CaptureFolder, RunFolder, capture_job, scans_job
 from geomocap.cli.progress import progress_bars
 from geomocap.cli.reports import capture_of, console, review_job, tell_results
 from geomocap.cli.settings_options import with_settings
 from geomocap.config import Config
 from geomocap.run import Run
+from viz.files import render_file
 from viz.review import review as review_files
 
 app = typer.Typer(
@@ -123,7 +126,23 @@ def review(run: RunFolder, workers: Workers = None) -> None:
     tell_results(run)
 
 
+@app.command()
+def render(
+    geometry: Annotated[
+        Path, typer.Argument(metavar="GEOMETRY", help="Mesh, point cloud or voxel grid: PLY, PCD, OBJ, STL, GLB …")
+    ],
+    picture: Annotated[
+        Path | None, typer.Argument(metavar="PICTURE.png", help="Picture to write; beside the file if not given.")
+    ] = None,
+    up: Annotated[Literal["x", "y", "z"], typer.Option("--up", help="World axis that points up.")] = "z",
+) -> None:
+    """Draw any geometry from four sides into a PNG, without a screen."""
+    console.print(f"picture: {render_file(geometry, picture, up)}")
+
+
 app.command()(captures.synthesize)
 app.command("import")(captures.import_)
 app.command()(captures.demo)
 app.command()(export)
+app.command()(evaluate)
+app.command()(info)

@@ -1,0 +1,141 @@
+"""Each mistake ends with one clear line and a status that is not zero, and nothing finished is lost."""
+
+from __future__ import annotations
+
+import shutil
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from geomocap.cameras import Rig
+from tests.cli.conftest import SETTINGS, last_line
+
+
+def refused(result) -> str:
+    assert result.returncode == 1
+    return last_line(result)
+
+
+def test_missing_capture(geomocap, tmp_path):
+    assert "no such capture folder" in refused(geomocap("run", tmp_path / "none", tmp_path / "run", check=False))
+
+
+def test_missing_camera_folder(capture, geomocap, tmp_path):
+    shutil.rmtree(next((capture / "images").iterdir()))
+    said = refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
+    assert "has no folder images/" in said
+
+
+def test_unequal_frame_counts(capture, geomocap, tmp_path):
+    folder = sorted((capture / "images").iterdir())[1]
+    (folder / "000005.png").unlink()
+    said = refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
+    assert "unequal numbers of frames" in said and f"{folder.name}: 5" in said
+
+
+def test_image_size_against_calibration(capture, geomocap, tmp_path):
+    folder = sorted((capture / "images").iterdir())[1]
+    for file in folder.iterdir():
+        cv2.imwrite(str(file), cv2.imread(str(file))[:100])
+    said = refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
+    assert f"camera {folder.name} are 160×100, but it is calibrated for 160×120" in said
+
+
+def test_truncated_png(capture, geomocap, tmp_path):
+    file = sorted((capture / "images").iterdir())[1] / "000003.png"
+    file.write_bytes(file.read_bytes()[:5000])
+    said = refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
+    assert f"{file}: truncated" in said
+
+
+def test_truncated_video(capture, geomocap, tmp_path):
+    folder = sorted((capture / "images").iterdir())[1]
+    shutil.rmtree(folder)
+    (capture / "videos").mkdir()
+    file = capture / "videos" / f"{folder.name}.mp4"
+    file.write_bytes(b"\0\0\0\x18ftypmp42" + bytes(500))
+    said = refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
+    assert f"{file}: no readable video" in said
+
+
+@pytest.mark.parametrize("frames", [[3], range(6)], ids=["in a frame", "in a camera"])
+def test_empty_silhouettes(capture, small_capture, geomocap, tmp_path, frames):
+    shutil.copytree(small_capture.parent / "truth" / "masks", capture / "masks")
+    folder = sorted((capture / "masks").iterdir())[2]
+    for k in frames:
+        cv2.imwrite(str(folder / f"{k:06d}.png"), np.zeros((120, 160), np.uint8))
+    said = refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
+    assert f"frame {next(iter(frames))}: the silhouette of camera {folder.name} is empty" in said
+
+
+def test_missing_given_mask(capture, small_capture, geomocap, tmp_path):
+    shutil.copytree(small_capture.parent / "truth" / "masks", capture / "masks")
+    file = sorted((capture / "masks").iterdir())[2] / "000002.png"
+    file.unlink()
+    assert str(file) in refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
+
+
+def test_camera_looking_away(capture, geomocap, tmp_path):
+    rig = Rig.read(capture / "sparse")
+    poses = np.array(rig.cam_from_world)
+    poses[1] = np.diag([1.0, -1.0, -1.0]) @ poses[1]  # turned by 180° about its x axis
+    shutil.rmtree(capture / "sparse")
+    Rig(rig.names, rig.cameras, poses).write(capture / "sparse")
+    said = refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
+    assert f"camera {rig.names[1]} looks away" in said
+
+
+def test_subject_outside_the_volume(capture, geomocap, tmp_path):
+    said = refused(
+        geomocap("voxels", capture, tmp_path / "run", "--carving.volume", "[[0, 0, 0], [1, 1, 1]]", check=False)
+    )
+    assert "volume" in said and "frame" in said
+
+
+def test_no_calibration(capture, geomocap, tmp_path):
+    shutil.rmtree(capture / "sparse")
+    said = refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
+    assert "not calibrated" in said and "geomocap calibrate" in said
+
+
+def test_damaged_calibration(capture, geomocap, tmp_path):
+    (capture / "sparse" / "images.txt").write_text("nonsense\n")
+    said = refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
+    assert "sparse" in said
+
+
+def test_calibration_that_lacks_a_camera(capture, geomocap, tmp_path):
+    rig = Rig.read(capture / "sparse")
+    shutil.rmtree(capture / "sparse")
+    rig.select(rig.names[:-1]).write(capture / "sparse")
+    said = refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
+    assert f"no posed image of camera {rig.names[-1]}" in said
+
+
+def test_unknown_setting(capture, geomocap, tmp_path):
+    (tmp_path / "a.toml").write_text("[carving]\nresolutoin = 64\n")
+    result = geomocap("run", capture, tmp_path / "run", "--config", tmp_path / "a.toml", check=False)
+    assert "unknown setting carving.resolutoin" in refused(result)
+
+
+def test_run_folder_that_can_not_be_written(capture, geomocap, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    said = refused(geomocap("run", capture, tmp_path / "file" / "run", *SETTINGS, check=False))
+    assert "can't be written" in said
+
+
+def test_run_folder_must_not_hold_the_capture(capture, geomocap):
+    assert "choose another folder" in refused(geomocap("run", capture, capture.parent, check=False))
+
+
+def test_no_dask_scheduler(capture, geomocap, tmp_path):
+    pytest.importorskip("distributed")
+    said = refused(geomocap("run", capture, tmp_path / "run", "--scheduler", "tcp://127.0.0.1:1", check=False))
+    assert "no Dask scheduler answers" in said
+
+
+def test_pycolmap_is_the_tested_version():
+    """Models of another version may read differently; the bounds of pyproject.toml keep to this one."""
+    assert pycolmap.__version__.startswith("4.2")

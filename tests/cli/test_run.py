@@ -1,0 +1,121 @@
+"""The main job from the command line: what it leaves, that it repeats, and that it goes on after being killed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from geomocap.geometry import BodyPoints, Voxels
+from tests.cli.conftest import CAMERAS, FRAMES, SETTINGS
+
+CHANGING = {"timings.json", "run.toml"}
+
+
+def digests(run: Path) -> dict[str, str]:
+    """Digest of every result file; the records of when and how long are left out."""
+    return {
+        str(p.relative_to(run)): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in sorted(run.rglob("*"))
+        if p.is_file() and p.name not in CHANGING and ".stages" not in p.parts
+    }
+
+
+@pytest.fixture(scope="session")
+def finished(small_capture, geomocap, tmp_path_factory) -> Path:
+    run = tmp_path_factory.mktemp("runs") / "run"
+    geomocap("run", small_capture, run, *SETTINGS, "--no-pictures")
+    return run
+
+
+def test_a_run_holds_what_the_contract_says(finished):
+    assert len(list(finished.glob("silhouettes/*/*.png"))) == CAMERAS * FRAMES
+    for k in range(FRAMES):
+        voxels = Voxels.read(finished / f"voxels/{k:06d}.ply")
+        bodies = BodyPoints.read(finished / f"bodies/{k:06d}.ply")
+        assert len(voxels.indices) == len(bodies.positions) > 500
+        np.testing.assert_allclose(bodies.positions, voxels.points, atol=1e-6)
+        assert len(np.unique(voxels.colors, axis=0)) > 10
+    ellipsoids = dict(np.load(finished / "ellipsoids.npz"))
+    skeleton = dict(np.load(finished / "skeleton.npz"))
+    T, K = ellipsoids["centers"].shape[:2]
+    assert T == FRAMES and ellipsoids["body"].shape == (K,)
+    B = skeleton["body_rotations"].shape[1]
+    assert skeleton["joint_positions"].shape == (FRAMES, B - 1, 3)
+    np.testing.assert_allclose(skeleton["body_rotations"][0], np.broadcast_to(np.eye(3), (B, 3, 3)), atol=1e-9)
+    for name in ("motion.bvh", "motion.trc", "motion.glb"):
+        assert (finished / name).stat().st_size > 100
+    record = tomllib.loads((finished / "run.toml").read_text())
+    assert record["config"]["carving"]["resolution"] == 64 and record["source"]["kind"] == "capture"
+    timings = json.loads((finished / "timings.json").read_text())
+    assert timings["silhouettes"]["items"] == CAMERAS * FRAMES and timings["voxels"]["items"] == FRAMES
+    assert not [p for p in finished.rglob("*") if ".tmp" in p.name]
+
+
+def test_results_repeat_bit_for_bit_with_any_number_of_workers(finished, small_capture, geomocap, tmp_path):
+    again = tmp_path / "again"
+    geomocap("run", small_capture, again, "--config", finished / "run.toml", "--workers", 3, "--no-pictures")
+    assert digests(again) == digests(finished)
+
+
+def test_nothing_is_done_twice(finished, small_capture, geomocap):
+    before = {p: p.stat().st_mtime_ns for p in finished.rglob("*.ply")}
+    geomocap("run", small_capture, finished, *SETTINGS, "--no-pictures")
+    assert {p: p.stat().st_mtime_ns for p in finished.rglob("*.ply")} == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stop_after", ["silhouettes/*/*.png", "voxels/*.ply", "bodies/*.ply"])
+def test_killed_run_goes_on_and_ends_with_the_same_files(finished, small_capture, geomocap, tmp_path, stop_after):
+    run = tmp_path / "run"
+    command = [sys.executable, "-m", "geomocap", "run", str(small_capture), str(run), *SETTINGS, "--no-pictures"]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    while process.poll() is None and len(list(run.glob(stop_after))) < 2:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    geomocap("run", small_capture, run, *SETTINGS, "--no-pictures")
+    assert digests(run) == digests(finished)
+
+
+def test_changed_setting_does_again_only_what_depends_on_it(small_capture, geomocap, tmp_path):
+    run = tmp_path / "run"
+    geomocap("voxels", small_capture, run, *SETTINGS)
+    masks = {p: p.stat().st_mtime_ns for p in run.rglob("*.png")}
+    first = digests(run)
+    geomocap("voxels", small_capture, run, "--carving.resolution", 48)
+    assert {p: p.stat().st_mtime_ns for p in run.rglob("*.png")} == masks
+    assert digests(run)["voxels/000000.ply"] != first["voxels/000000.ply"]
+
+
+def test_given_masks_are_used_as_they_are(capture, small_capture, geomocap, tmp_path):
+    truth = small_capture.parent / "truth" / "masks"
+    (capture / "masks").symlink_to(truth)
+    geomocap("silhouettes", capture, tmp_path / "run")
+    for file in truth.rglob("*.png"):
+        import cv2
+
+        made = cv2.imread(str(tmp_path / "run/silhouettes" / file.relative_to(truth)), cv2.IMREAD_GRAYSCALE)
+        np.testing.assert_array_equal(made, cv2.imread(str(file), cv2.IMREAD_GRAYSCALE))
+
+
+def test_scans_are_segmented_like_voxels(finished, geomocap, tmp_path):
+    geomocap("segment", finished / "voxels", tmp_path / "run", "--fps", 10, "--no-pictures")
+    ours, other = np.load(tmp_path / "run/ellipsoids.npz"), np.load(finished / "ellipsoids.npz")
+    np.testing.assert_allclose(ours["centers"], other["centers"], atol=1e-9)
+    np.testing.assert_array_equal(ours["body"], other["body"])
+
+
+def test_single_scan_gets_its_ellipsoids(finished, geomocap, tmp_path):
+    geomocap("segment", finished / "voxels/000000.ply", tmp_path / "run", "--no-pictures")
+    ellipsoids = np.load(tmp_path / "run/ellipsoids.npz")
+    assert ellipsoids["centers"].shape[0] == 1 and ellipsoids["centers"].shape[1] > 10
+    assert not (tmp_path / "run/skeleton.npz").exists()
