@@ -111,7 +111,7 @@ def record_bar(
             picture = cv2.cvtColor(expose(image, gains[c], noise, (seed, 5, c, p)), cv2.COLOR_RGB2BGR)
 
             def write(path: Path, picture: np.ndarray = picture) -> bool:
-                return cv2.imwrite(str(path), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+                return cv2.imwrite(str(path), picture)
 
             write_atomic(capture / "bar" / name / f"{p:06d}.png", write)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import tomllib
 from dataclasses import dataclass
@@ -176,7 +175,7 @@ def import_colmap(
 
 
 def _must_be_free(capture: Path) -> None:
-    if capture.is_dir() and any(os.scandir(capture)):
+    if capture.is_dir() and any(capture.iterdir()):
         raise CaptureError(f"{capture}: is not empty; remove it or choose another folder")
 
 

@@ -66,7 +66,7 @@ class Room:
     high: np.ndarray
     seed: int = 0
 
-    def render(self, view: View, light: Light, samples: int = 4) -> np.ndarray:
+    def render(self, view: View, light: Light, samples: int = 3) -> np.ndarray:
         """Render the empty room, antialiased with `samples`² rays a pixel: (H, W, 3) float32, grey levels."""
         return _render(view.corners, view.origin, self.low, self.high, light.vector, samples, self.seed)
 

@@ -296,7 +296,7 @@ def write_truth(
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
-    """Write an image (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) grey, uint8, fast rather than small."""
+    """Write an image (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) grey, uint8, with OpenCV's fast default compression."""
     if image.ndim == 3:
         image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
-    write_atomic(path, lambda p: cv2.imwrite(str(p), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]))
+    write_atomic(path, lambda p: cv2.imwrite(str(p), image))
