@@ -117,5 +117,5 @@ def test_scans_are_segmented_like_voxels(finished, geomocap, tmp_path):
 def test_single_scan_gets_its_ellipsoids(finished, geomocap, tmp_path):
     geomocap("segment", finished / "voxels/000000.ply", tmp_path / "run", "--no-pictures")
     ellipsoids = np.load(tmp_path / "run/ellipsoids.npz")
-    assert ellipsoids["centers"].shape[0] == 1 and ellipsoids["centers"].shape[1] > 10
+    assert ellipsoids["centers"].shape[0] == 1 and ellipsoids["centers"].shape[1] >= 4
     assert not (tmp_path / "run/skeleton.npz").exists()
