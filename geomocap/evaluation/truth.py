@@ -88,7 +88,7 @@ class Truth:
         """
         file = path / "truth.npz" if path.is_dir() else path
         try:
-            with np.load(file, allow_pickle=False) as data:
+            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
                 arrays = dict(data)
         except FileNotFoundError:
             raise EvaluationError(f"{file}: missing; a truth is a folder with truth.npz, or a motion file") from None

@@ -71,7 +71,8 @@ def _tell_points(markers: Markers, told: Description) -> None:
     extent = float(np.median(boxes.max(axis=1)))
     if len(markers.names) > 1 and not EXTENTS[0] <= extent <= EXTENTS[1]:
         told.problem(f"the points span {extent:.4g} m: the file's lengths are likely in another unit")
-    never = [n for n, p in zip(markers.names, present.any(axis=0).tolist(), strict=True) if not p]
+    ever: list[bool] = np.any(present, axis=0).tolist()
+    never = [n for n, p in zip(markers.names, ever, strict=True) if not p]
     if never:
         told.problem(f"{count(len(never), 'point')} without any position: {shortened(never)}")
     speed = np.linalg.norm(np.diff(markers.positions, axis=0), axis=-1) * markers.fps

@@ -1,0 +1,143 @@
+import numpy as np
+import pycolmap
+import pytest
+from cv2 import imwrite
+
+from geomocap.cameras import Rig
+from geomocap.export.run_export import export_run
+from geomocap.inspection import describe
+from geomocap.inspection.describe import InspectionError
+from tests.geomocap.articulated import skeleton_arrays
+from tests.geomocap.made_truth import flawed_run, write_truth
+
+
+def facts(path):
+    told = describe(path)
+    return told, dict(told.facts)
+
+
+def two_cameras(away=False):
+    camera = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[60, 60, 32, 24])
+    poses = np.zeros((3, 3, 4))
+    for c, angle in enumerate((0, 1.5, 3.0)):
+        z = np.array([np.cos(angle), np.sin(angle), 0]) * (-1 if not (away and c == 2) else 1)
+        R = np.stack([np.cross([0, 0, -1.0], z), [0, 0, -1], z])
+        poses[c, :, :3] = R
+        poses[c, :, 3] = -R @ (3 * np.array([np.cos(angle), np.sin(angle), 0.2]))
+    return Rig(("a", "b", "c"), (camera,) * 3, poses)
+
+
+@pytest.fixture
+def capture(tmp_path):
+    folder = tmp_path / "capture"
+    for name in "abc":
+        (folder / "images" / name).mkdir(parents=True)
+        for k in range(3):
+            imwrite(str(folder / "images" / name / f"{k:06d}.png"), np.zeros((48, 64, 3), np.uint8))
+    (folder / "capture.toml").write_text('name = "walk"\nfps = 15.0\n')
+    return folder
+
+
+def test_a_capture_without_and_with_calibration(capture):
+    told, said = facts(capture)
+    assert told.kind == "capture"
+    assert said["frames"] == "3 at 15 per second, 0.20 s"
+    assert said["cameras"] == "3: a, b, c (images)"
+    assert said["image sizes"] == "64×48 (3 cameras)"
+    assert len(told.problems) == 1 and told.problems[0].startswith("not calibrated")
+    two_cameras().write(capture / "sparse")
+    told, said = facts(capture)
+    assert told.problems == []
+    assert "focal length 60.0 px (56° across)" in said["a"]
+
+
+def test_a_capture_with_problems(capture):
+    two_cameras(away=True).write(capture / "sparse")
+    (capture / "images" / "b" / "000002.png").write_bytes(b"")
+    (capture / "background").mkdir()
+    imwrite(str(capture / "background" / "a.png"), np.zeros((48, 64, 3), np.uint8))
+    problems = describe(capture).problems
+    assert any("000002.png: truncated" in p for p in problems)
+    assert any(p.startswith("camera c: looks away") for p in problems)
+    assert any(p.startswith("no background picture of b, c") for p in problems)
+    (capture / "images" / "c" / "000002.png").unlink()
+    assert "unequal numbers of frames" in describe(capture).problems[0]
+
+
+def test_a_calibration(tmp_path):
+    two_cameras().write(tmp_path / "sparse")
+    for path in (tmp_path, tmp_path / "sparse"):
+        told, said = facts(path)
+        assert told.kind == "calibration"
+        assert said["calibration"].startswith("3 cameras, looking at about")
+        assert told.problems == []
+
+
+def test_a_run_with_its_flaws(tmp_path):
+    run = flawed_run(tmp_path)
+    run.frame_file("cloud", 4).unlink()
+    run.begin("tracks", "key", [])
+    (tmp_path / ".motion.tmp.bvh").write_text("")
+    told, said = facts(tmp_path)
+    assert told.kind == "run"
+    assert said["skeleton"] == "4 joints between 4 bodies"
+    assert said["bodies"] == "16 frames, 000000 to 000015"
+    assert said["tracks"].startswith("20 points in 16 frames")
+    assert any("cloud/ lacks 1 frame from 000004 on" in p for p in told.problems)
+    assert any("joints lack a position in 1.6 %" in p for p in told.problems)
+    assert any("stage tracks isn't finished" in p for p in told.problems)
+    assert any(".motion.tmp.bvh was left" in p for p in told.problems)
+    np.savez(tmp_path / "tracks.npz", velocities=np.zeros(3))
+    assert any(p.startswith("tracks.npz: lacks 'positions'") for p in describe(tmp_path).problems)
+
+
+def test_a_truth(tmp_path):
+    told, said = facts(write_truth(tmp_path))
+    assert told.kind == "truth"
+    assert said["bodies that move"] == "4, beginning at trunk, arm, hand, leg"
+    assert told.problems == []
+    told = describe(write_truth(tmp_path, fps=np.array(-1.0)))
+    assert "fps is -1.0" in told.problems[0]
+
+
+@pytest.fixture
+def motion_files(tmp_path):
+    from geomocap.run import Run
+
+    run = Run(tmp_path / "run")
+    run.write_npz("skeleton.npz", **skeleton_arrays())
+    return export_run(run, ["bvh", "trc", "glb"]).files
+
+
+def test_motion_files(motion_files):
+    for name, path in motion_files.items():
+        told, said = facts(path)
+        assert told.problems == []
+        if name != "glb":
+            assert said["frames"] == "20 at 15 per second, 1.33 s"
+    assert facts(motion_files["bvh"])[1]["joints"].startswith("7: body00")
+    assert facts(motion_files["glb"])[1]["animation motion"] == "20 key frames, 1.27 s"
+
+
+def test_motion_files_with_problems(motion_files):
+    bvh, trc, glb = (motion_files[k] for k in ("bvh", "trc", "glb"))
+    trc.write_text(trc.read_text().replace("\tmm\t", "\tm\t"))
+    assert any("likely in another unit" in p for p in describe(trc).problems)
+    assert any("m/s after frame" in p for p in describe(trc).problems)
+    bvh.write_text("HIERARCHY")
+    assert "no BVH" in describe(bvh).problems[0]
+    data = glb.read_bytes()
+    glb.write_bytes(data[:-40])
+    assert "it was cut off" in describe(glb).problems[0]
+    glb.write_bytes(b"glb")
+    assert "no GLB file" in describe(glb).problems[0]
+
+
+def test_nothing_known(tmp_path):
+    with pytest.raises(InspectionError, match="no such file or folder"):
+        describe(tmp_path / "nothing")
+    with pytest.raises(InspectionError, match="neither a capture"):
+        describe(tmp_path)
+    (tmp_path / "a.fbx").write_text("")
+    with pytest.raises(InspectionError, match="no known kind of file"):
+        describe(tmp_path / "a.fbx")
