@@ -30,7 +30,7 @@ def closest_vertices(points, vertices):
 
 def dense_surface(t, frame):
     """Points all over the true triangles, and the rig joint that owns each: a slow stand-in for closest points."""
-    grid = np.array([(i, j) for i in range(7) for j in range(7 - i)]) / 6
+    grid = np.array([(i, j) for i in range(13) for j in range(13 - i)]) / 12
     weights = np.stack([1 - grid.sum(axis=1), grid[:, 0], grid[:, 1]], axis=1)
     points = np.einsum("wk,fkc->fwc", weights, t["vertices"][frame][t["faces"]])
     owner = np.repeat(t["vertex_joint"][t["faces"][:, 0]], len(weights))
