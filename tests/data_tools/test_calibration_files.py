@@ -1,198 +1,210 @@
+"""Calibrations of other tools: nothing is lost on the way out and back, and wrong conventions are named."""
+
 from __future__ import annotations
 
+import shutil
+import tomllib
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
+import tomli_w
 
-from data_tools.calibration_files import read_pose2sim, read_qualisys, write_pose2sim
-from data_tools.calibration_files.opencv_cameras import camera_from_opencv, camera_to_opencv
-from data_tools.views import look_at
+from data_tools import calibration_files as formats
 from geomocap.cameras import Rig
 from geomocap.errors import CalibrationError
 
-QUALISYS = """<?xml version='1.0' encoding='ASCII'?>
-<calibration><cameras>
-<camera active="1" serial="left" viewrotation="0">
- <fov_video bottom="479" left="{left}" right="{right}" top="{top}"/>
- <transform {rotation} x="{c[0]}" y="{c[1]}" z="{c[2]}"/>
- <intrinsic centerPointU="{cu}" centerPointV="{cv}" focalLengthU="38400" focalLengthV="38464" skew="0.0"
-  radialDistortion1="-0.05" radialDistortion2="0.01" radialDistortion3="{k3}"
-  tangentalDistortion1="0.001" tangentalDistortion2="-0.002"
-  sensorMaxU="40896" sensorMaxV="30656" sensorMinU="0" sensorMinV="0"/>
-</camera>
-<camera active="0" serial="unused"/>
-</cameras></calibration>"""
-
-POSE = look_at(np.array([2.0, -3.0, 1.5]), np.array([0.0, 0.0, 1.0]))
+MODELS = {
+    "PINHOLE": [800.25, 801.5, 641.123456789, 355.75],
+    "OPENCV": [800.25, 801.5, 641.123456789, 355.75, -0.21, 0.034, 1.1e-3, -7e-4],
+    "FULL_OPENCV": [800.25, 801.5, 641.123456789, 355.75, -0.21, 0.034, 1.1e-3, -7e-4, 0.012, 0.0, 0.0, 0.0],
+}
+RATIONAL = [800.25, 801.5, 641.123456789, 355.75, -0.21, 0.034, 1.1e-3, -7e-4, 0.012, 0.003, -0.002, 0.001]
 
 
-def qualisys(left: int = 0, top: int = 0, k3: float = 0.0, text: str = QUALISYS) -> str:
-    R = np.diag([1.0, -1.0, -1.0]) @ POSE[:, :3]  # its own inverse
-    rotation = " ".join(
-        f'r{i + 1}{j + 1}="{R[i, j]!r}"'.replace("np.float64(", "").replace(")", "") for i in range(3) for j in range(3)
+def rig_of(model: str, params: list[float] | None = None, n: int = 4) -> Rig:
+    """Cameras in a ring of 3 m that look at (0, 0, 1)."""
+    rng = np.random.default_rng(3)
+    poses = []
+    for k in range(n):
+        a = 2 * np.pi * k / n + rng.uniform(-0.1, 0.1)
+        c = np.array([3 * np.cos(a), 3 * np.sin(a), 1.4 + 0.2 * k])
+        z = np.array([0, 0, 1.0]) - c
+        z /= np.linalg.norm(z)
+        x = np.cross(z, [0, 0, 1.0])
+        x /= np.linalg.norm(x)
+        R = np.array([x, np.cross(z, x), z])
+        poses.append(np.column_stack([R, -R @ c]))
+    cameras = tuple(
+        pycolmap.Camera(model=model, width=1280, height=720, params=params or MODELS[model]) for _ in range(n)
     )
-    return text.format(
-        rotation=rotation,
-        c=(2000.0, -3000.0, 1500.0),
-        left=left,
-        right=639,
-        top=top,
-        cu=64 * 310.0,
-        cv=64 * 245.0,
-        k3=k3,
-    )
+    return Rig(tuple(f"cam{k:02d}" for k in range(n)), cameras, np.array(poses))
 
 
-def opencv_project(points: np.ndarray, K: np.ndarray, distortions: list[float]) -> np.ndarray:
-    rotation = cv2.Rodrigues(POSE[:, :3])[0]
-    return cv2.projectPoints(points, rotation, POSE[:, 3], K, np.array(distortions))[0].reshape(-1, 2)
+def assert_same(a: Rig, b: Rig) -> None:
+    assert a.names == b.names
+    np.testing.assert_array_equal(a.sizes, b.sizes)
+    np.testing.assert_allclose(a.cam_from_world, b.cam_from_world, rtol=1e-9, atol=1e-12)
+    points = np.random.default_rng(0).uniform([-0.8, -0.8, 0], [0.8, 0.8, 2], (50, 3))
+    np.testing.assert_allclose(a.project(points), b.project(points), rtol=1e-9)
+    for one, other in zip(a.cameras, b.cameras, strict=True):
+        np.testing.assert_allclose(one.calibration_matrix(), other.calibration_matrix(), rtol=1e-9)
 
 
-POINTS = np.random.default_rng(0).uniform([-0.6, -0.6, 0.2], [0.6, 0.6, 1.8], (40, 3))
+ROUND_TRIPS = {
+    "aniposelib": (lambda r, p: formats.write_aniposelib(r, p / "calibration.toml"), "calibration.toml"),
+    "caliscope": (lambda r, p: formats.write_caliscope(r, p / "camera_array.toml"), "camera_array.toml"),
+    "pose2sim": (lambda r, p: formats.write_pose2sim(r, p / "Calib.toml"), "Calib.toml"),
+    "easymocap": (lambda r, p: formats.write_easymocap(r, p), "."),
+    "opencv": (lambda r, p: formats.write_opencv(r, p), "."),
+    "colmap text": (lambda r, p: formats.write_colmap(r, p), "."),
+    "colmap binary": (lambda r, p: formats.write_colmap(r, p, binary=True), "."),
+}
 
 
-@pytest.mark.parametrize("k3", [0.0, 0.02])
-def test_qualisys_projects_as_its_conventions_say(tmp_path: Path, k3: float) -> None:
-    file = tmp_path / "a.qca.txt"
-    file.write_text(qualisys(k3=k3))
-    rig = read_qualisys(file)
-    assert rig.names == ("left",)
-    assert rig.sizes.tolist() == [[640, 480]]
-    np.testing.assert_allclose(rig.centers, [[2, -3, 1.5]], atol=1e-9)
-    K = np.array([[600.0, 0, 310], [0, 601, 245], [0, 0, 1]])
-    expected = opencv_project(POINTS, K, [-0.05, 0.01, 0.001, -0.002, k3]) + 0.5
-    np.testing.assert_allclose(rig.project(POINTS)[0], expected, atol=1e-6)
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("kind", ROUND_TRIPS)
+def test_round_trip_keeps_cameras_and_recognises_the_format(kind: str, model: str, tmp_path: Path) -> None:
+    write, name = ROUND_TRIPS[kind]
+    rig = rig_of(model)
+    write(rig, tmp_path)
+    expected = {"caliscope": "aniposelib"}.get(kind, kind.split()[0])
+    assert formats.detect_format(tmp_path / name) == expected
+    assert_same(rig, formats.read_calibration(tmp_path / name))
 
 
-def test_qualisys_field_of_view_moves_the_principal_point(tmp_path: Path) -> None:
-    file = tmp_path / "a.qca.txt"
-    file.write_text(qualisys(left=40, top=8))
-    camera = read_qualisys(file).cameras[0]
-    assert (camera.width, camera.height) == (600, 472)
-    assert (camera.principal_point_x, camera.principal_point_y) == (310 - 40 + 0.5, 245 - 8 + 0.5)
+@pytest.mark.parametrize("kind", [k for k in ROUND_TRIPS if k != "caliscope"])
+def test_rational_distortion_is_kept(kind: str, tmp_path: Path) -> None:
+    write, name = ROUND_TRIPS[kind]
+    rig = rig_of("FULL_OPENCV", RATIONAL)
+    write(rig, tmp_path)
+    assert_same(rig, formats.read_calibration(tmp_path / name))
+
+
+def test_a_format_that_would_drop_terms_says_which(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match="caliscope keeps k1 k2 p1 p2 k3 only"):
+        formats.write_caliscope(rig_of("FULL_OPENCV", RATIONAL), tmp_path / "c.toml")
+    fisheye = rig_of("OPENCV_FISHEYE", [800, 800, 640, 360, 0.1, 0.01, 0, 0])
+    with pytest.raises(CalibrationError, match="fisheye"):
+        formats.write_easymocap(fisheye, tmp_path)
+    formats.write_aniposelib(fisheye, tmp_path / "fisheye.toml")
+    assert_same(fisheye, formats.read_aniposelib(tmp_path / "fisheye.toml"))
+
+
+def test_half_pixel_between_opencv_and_colmap(tmp_path: Path) -> None:
+    rig = rig_of("PINHOLE")
+    formats.write_aniposelib(rig, tmp_path / "c.toml")
+    table = tomllib.loads((tmp_path / "c.toml").read_text())["cam_0"]
+    assert table["matrix"][0][2] == pytest.approx(641.123456789 - 0.5, abs=1e-12)
+
+
+def test_caliscope_example(data: Path) -> None:
+    folder = data / "captures" / "caliscope_charuco"
+    one, other = (formats.read_calibration(folder / f) for f in ("config.toml", "camera_array.toml"))
+    assert_same(one, other)
+    assert one.names == ("cam_0", "cam_1", "cam_2", "cam_3")
+    assert one.cameras[0].model.name == "FULL_OPENCV"
+    assert one.cameras[0].params[8] == pytest.approx(0.0665682301495769)
+
+
+def test_pose2sim_example_is_recognised(data: Path) -> None:
+    file = data / "captures" / "pose2sim_single" / "calibration" / "Calib.qca.txt"
+    assert formats.detect_format(file) == "qualisys"
+    rig = formats.read_calibration(file)
+    assert 4 < np.linalg.norm(rig.centers[0] - rig.centers[2]) < 9
+
+
+def altered(tmp_path: Path, change: str) -> Path:
+    rig = rig_of("OPENCV")
+    file = tmp_path / "c.toml"
+    formats.write_caliscope(rig, file)
+    content = tomllib.loads(file.read_text())
+    for table in content["cameras"].values():
+        R, t = np.array(table["rotation"]), np.array(table["translation"])
+        if change == "millimetres":
+            t = t * 1000
+        elif change == "centimetres":
+            t = t * 100
+        elif change == "transposed":
+            R = R.T
+        elif change == "inverse":
+            R, t = R.T, -R.T @ t
+        elif change == "mirrored":
+            R = R @ np.diag([1, 1, -1])
+        elif change == "backwards":
+            R, t = np.diag([1, -1, -1]) @ R, np.diag([1, -1, -1]) @ t
+        elif change == "matrix":
+            table["matrix"] = np.array(table["matrix"]).T.tolist()
+        elif change == "size":
+            table["size"] = [640, 360]
+        elif change == "portrait":
+            table["size"] = [720, 1280]
+            table["matrix"][0][2], table["matrix"][1][2] = 900.0, 300.0
+        table["rotation"], table["translation"] = R.tolist(), t.tolist()
+    file.write_text(tomli_w.dumps(content))
+    return file
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "message"),
+    ("change", "named"),
     [
-        ("<calibration>", "", "no readable XML"),
-        ('active="1"', 'active="0"', "no active camera"),
-        ('viewrotation="0"', 'viewrotation="90"', "viewrotation"),
-        ('focalLengthU="38400"', "", "focalLengthU"),
-        ('skew="0.0"', 'skew="2.0"', "skew"),
-        ("<transform", "<transported", "<transform>"),
-        ('x="2000.0"', 'x="far"', "number x"),
-        ("<calibration>", "<!DOCTYPE x><calibration>", "document type"),
+        ("millimetres", "millimetres"),
+        ("centimetres", "centimetres"),
+        ("transposed", "transposed"),
+        ("inverse", "world-from-camera"),
+        ("mirrored", "mirrors the world"),
+        ("backwards", "look backwards"),
+        ("matrix", "transposed"),
+        ("size", "2 times as large"),
+        ("portrait", "swapped"),
     ],
 )
-def test_broken_qualisys_says_what_is_wrong(tmp_path: Path, before: str, after: str, message: str) -> None:
-    file = tmp_path / "a.qca.txt"
-    file.write_text(qualisys().replace(before, after, 1))
-    with pytest.raises(CalibrationError, match=message):
-        read_qualisys(file)
+def test_wrong_conventions_are_named(change: str, named: str, tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=named):
+        formats.read_calibration(altered(tmp_path, change))
 
 
-def test_real_qualisys_cameras_stand_round_the_person(data: Path) -> None:
-    rig = read_qualisys(data / "captures" / "pose2sim_single" / "calibration" / "Calib.qca.txt")
-    assert rig.names == ("cam01", "cam02", "cam03", "cam04")
-    assert rig.sizes.tolist() == [[1088, 1920]] * 4
-    assert np.all((rig.centers[:, 2] > 1.5) & (rig.centers[:, 2] < 2.2))
-    seen = rig.project(np.array([[-0.7, 0.0, 1.0]]))[:, 0]  # a person's hips on the treadmill
-    assert np.all((seen > 0) & (seen < rig.sizes))
-    up = -rig.cam_from_world[:, 1, 2]  # images stand upright: y is down, z is up
-    assert np.all(up > 0.8)
+def test_millimetres_are_read_when_said(tmp_path: Path) -> None:
+    rig = formats.read_calibration(altered(tmp_path, "millimetres"), metres_per_unit=0.001)
+    np.testing.assert_allclose(rig.centers, rig_of("OPENCV").centers, atol=1e-9)
 
 
-@given(
-    rotation=st.tuples(*[st.floats(-3, 3)] * 3),
-    k=st.lists(st.floats(-0.3, 0.3), min_size=4, max_size=4),
-    fisheye=st.booleans(),
-)
-def test_pose2sim_comes_back_as_written(tmp_path_factory, rotation, k, fisheye: bool) -> None:
-    model = "OPENCV_FISHEYE" if fisheye else "OPENCV"
-    camera = pycolmap.Camera(model=model, width=640, height=480, params=[600, 610, 320.25, 241.5, *k])
-    pose = np.column_stack([Rotation.from_rotvec(rotation).as_matrix(), [0.1, -0.2, 3.0]])
-    file = tmp_path_factory.mktemp("pose2sim") / "Calib.toml"
-    write_pose2sim(Rig(("a",), (camera,), pose[None]), file)
-    back = read_pose2sim(file)
-    np.testing.assert_allclose(back.cam_from_world[0], pose, atol=1e-9)
-    np.testing.assert_allclose(back.cameras[0].params[:4], camera.params[:4], atol=1e-9)
-    if any(k) or fisheye:
-        np.testing.assert_allclose(back.cameras[0].params[4:], k)
+def test_easymocap_with_transposed_rotation_and_without_size(tmp_path: Path) -> None:
+    rig = rig_of("OPENCV")
+    formats.write_easymocap(rig, tmp_path)
+    text = (tmp_path / "intri.yml").read_text()
+    (tmp_path / "intri.yml").write_text("\n".join(line for line in text.splitlines() if line[:2] not in ("H_", "W_")))
+    with pytest.raises(CalibrationError, match="image size"):
+        formats.read_calibration(tmp_path)
+    sizes = dict.fromkeys(rig.names, (1280, 720))
+    assert_same(rig, formats.read_calibration(tmp_path, sizes=sizes))
+    storage = cv2.FileStorage(str(tmp_path / "extri.yml"), cv2.FileStorage_WRITE)
+    storage.startWriteStruct("names", cv2.FileNode_SEQ)
+    for name in rig.names:
+        storage.write("", name)
+    storage.endWriteStruct()
+    for name, pose in zip(rig.names, rig.cam_from_world, strict=True):
+        storage.write(f"R_{name}", cv2.Rodrigues(np.array(pose[:, :3]))[0])
+        storage.write(f"Rot_{name}", np.ascontiguousarray(pose[:, :3].T))
+        storage.write(f"T_{name}", np.array(pose[:, 3:]))
+    storage.release()
+    with pytest.raises(CalibrationError, match="transpose"):
+        formats.read_calibration(tmp_path, sizes=sizes)
 
 
-def test_pose2sim_is_read_as_opencv_means_it(tmp_path: Path) -> None:
-    rotation = Rotation.from_matrix(POSE[:, :3]).as_rotvec().tolist()
-    file = tmp_path / "Calib.toml"
-    file.write_text(
-        f"""[cam_1]
-name = "left"
-size = [640.0, 480.0]
-matrix = [[600.0, 0.0, 310.0], [0.0, 601.0, 245.0], [0.0, 0.0, 1.0]]
-distortions = [-0.05, 0.01, 0.001, -0.002]
-rotation = {rotation}
-translation = {POSE[:, 3].tolist()}
-fisheye = false
-[metadata]
-adjusted = false
-"""
-    )
-    rig = read_pose2sim(file)
-    assert rig.names == ("left",)
-    K = np.array([[600.0, 0, 310], [0, 601, 245], [0, 0, 1]])
-    expected = opencv_project(POINTS, K, [-0.05, 0.01, 0.001, -0.002]) + 0.5
-    np.testing.assert_allclose(rig.project(POINTS)[0], expected, atol=1e-6)
-
-
-def test_opencv_distortions_of_all_lengths() -> None:
-    K = np.array([[600.0, 0, 310], [0, 601, 245], [0, 0, 1]])
-    for distortions, model in (
-        ([], "PINHOLE"),
-        ([0.1, 0, 0, 0], "OPENCV"),
-        ([0.1, 0.2, 0, 0, 0.3], "FULL_OPENCV"),
-        ([0.1, 0.2, 0.01, 0.02, 0.3, 0.1, 0.2, 0.05], "FULL_OPENCV"),
-    ):
-        camera = camera_from_opencv(K, distortions, 640, 480, where="here")
-        assert camera.model.name == model
-        matrix, back, fisheye = camera_to_opencv(camera)
-        np.testing.assert_allclose(matrix, K)
-        padded = np.zeros(len(back))
-        padded[: len(distortions)] = distortions
-        np.testing.assert_allclose(back, padded)
-        assert not fisheye
-
-
-@pytest.mark.parametrize(
-    ("matrix", "distortions", "message"),
-    [
-        (np.array([[600.0, 0, 0], [0, 600, 0], [310, 245, 1]]), [], "transposed"),
-        (np.array([[600.0, 3, 310], [0, 600, 245], [0, 0, 1]]), [], "skew"),
-        (np.array([[-600.0, 0, 310], [0, 600, 245], [0, 0, 1]]), [], "positive"),
-        (np.eye(2), [], "3×3"),
-        (np.array([[600.0, 0, 310], [0, 600, 245], [0, 0, 1]]), [0.1, 0.2], "2 distortion coefficients"),
-    ],
-)
-def test_bad_matrices_are_refused(matrix, distortions, message: str) -> None:
-    with pytest.raises(CalibrationError, match=f"here: .*{message}"):
-        camera_from_opencv(matrix, distortions, 640, 480, where="here")
-
-
-def test_broken_pose2sim_says_what_is_wrong(tmp_path: Path) -> None:
-    file = tmp_path / "Calib.toml"
-    for text, message in (
-        ("[metadata]\nerror = 0.0", "holds no camera"),
-        ("[a]\nmatrix = [[1", "not valid TOML"),
-        ("[a]\nmatrix = [[1.0]]\n", "has no `size`"),
-        ('[a]\nmatrix = [["x"]]\nsize = [1, 2]\nrotation = [0, 0, 0]\ntranslation = [0, 0, 0]', "camera a: numbers"),
-    ):
-        file.write_text(text)
-        with pytest.raises(CalibrationError, match=message):
-            read_pose2sim(file)
-    with pytest.raises(CalibrationError, match="can't be read"):
-        read_pose2sim(tmp_path / "none.toml")
+@pytest.mark.parametrize("text", ["", "no toml =", "[cam_0]\nsize = [1, 2]", "%YAML:1.0\n---\nnames: 3"])
+def test_other_files_are_refused_in_one_line(text: str, tmp_path: Path) -> None:
+    for name in ("c.toml", "c.xml", "c.txt"):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(CalibrationError) as error:
+            formats.read_calibration(tmp_path / name)
+        assert "\n" not in str(error.value) and name in str(error.value)
+    (tmp_path / "intri.yml").write_text(text)
+    (tmp_path / "extri.yml").write_text(text)
+    with pytest.raises(CalibrationError):
+        formats.read_calibration(tmp_path)
+    shutil.rmtree(tmp_path)
+    with pytest.raises(CalibrationError):
+        formats.read_calibration(tmp_path)

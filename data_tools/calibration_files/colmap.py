@@ -1,0 +1,55 @@
+"""Calibrations as COLMAP models, text or binary."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from data_tools.calibration_files.plausibility import check_rig, in_metres
+from geomocap.cameras import Rig
+from geomocap.errors import RunError
+
+
+def read_colmap(folder: Path, metres_per_unit: float = 1.0) -> Rig:
+    """Read the cameras of a COLMAP model; a folder with `sparse/0`, `sparse` or the model itself.
+
+    Parameters
+    ----------
+    folder : Path
+    metres_per_unit : float
+        Length of the model's unit, metres. A model from images alone has an arbitrary one.
+
+    Raises
+    ------
+    CalibrationError
+        If there is no model, a camera moves, or its unit can't be the metre.
+    """
+    folder = Path(folder)
+    places = (folder / "sparse" / "0", folder / "sparse", folder)
+    model = next((p for p in places if any(p.glob("cameras.*"))), folder)
+    rig = Rig.read(model)
+    poses = np.array(rig.cam_from_world)
+    poses[:, :, 3] = in_metres(poses[:, :, 3], metres_per_unit, str(model))
+    rig = Rig(rig.names, rig.cameras, poses)
+    check_rig(rig, str(model))
+    return rig
+
+
+def write_colmap(rig: Rig, folder: Path, *, binary: bool = False) -> None:
+    """Write a rig as a COLMAP model.
+
+    Raises
+    ------
+    RunError
+        If the folder can't be written.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if binary:
+            rig.reconstruction().write_binary(str(folder))
+        else:
+            rig.reconstruction().write_text(str(folder))
+    except OSError as error:
+        raise RunError(f"{folder}: can't be written ({error.strerror or error})") from None
