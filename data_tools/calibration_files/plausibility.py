@@ -95,15 +95,18 @@ def check_rig(rig: Rig, where: str) -> None:
         raise CalibrationError(
             f"{where}: cameras are only {spread:.2g} m apart; the file's unit is not the metre, give metres_per_unit"
         )
-    if looking_together(rig.cam_from_world, rig)[0] > 0.5:
-        return
     R, t = rig.cam_from_world[:, :, :3], rig.cam_from_world[:, :, 3]
     Rt = np.swapaxes(R, 1, 2)
+    inverse = np.concatenate([Rt, -np.einsum("cij,cj->ci", Rt, t)[:, :, None]], axis=2)
+    together = looking_together(rig.cam_from_world, rig)[0]
+    # Upright cameras around a place look all the same way when their poses are inverted
+    share, angle = looking_together(inverse, rig)
+    parallel = _widest_angle(R) < 0.7 and _widest_angle(Rt) > 1.0 and share > 0.99 and angle < 0.35
+    if together > 0.5 and not parallel:
+        return
     others = {
         "its rotations are transposed": np.concatenate([Rt, t[:, :, None]], axis=2),
-        "its poses are world-from-camera instead of camera-from-world": np.concatenate(
-            [Rt, -np.einsum("cij,cj->ci", Rt, t)[:, :, None]], axis=2
-        ),
+        "its poses are world-from-camera instead of camera-from-world": inverse,
         "its translations are camera centres": np.concatenate([R, -np.einsum("cij,cj->ci", R, t)[:, :, None]], axis=2),
         "its cameras look backwards (an OpenGL convention: y up, z back)": rig.cam_from_world
         * np.array([1.0, -1.0, -1.0])[None, :, None],
@@ -145,6 +148,12 @@ def looking_together(poses: np.ndarray, rig: Rig) -> tuple[float, float]:
             margin = 0.25 * np.array([camera.width, camera.height])
             inside += bool((u > -margin).all() and (u < margin * 5).all())
     return inside / len(poses), float(np.mean(angles))
+
+
+def _widest_angle(R: np.ndarray) -> float:
+    """Largest angle between two optical axes, radians."""
+    axes = R[:, 2]
+    return float(np.arccos(np.clip(axes @ axes.T, -1, 1)).max())
 
 
 def in_metres(translation: np.ndarray, metres_per_unit: float, where: str) -> np.ndarray:
