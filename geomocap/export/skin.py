@@ -18,6 +18,7 @@ from geomocap.export.surface import Surface, surface_through
 from geomocap.geometry import Voxels
 from geomocap.run import Run
 
+VOTERS = 15  # points that say which body a vertex belongs to
 STEP = 0.5  # of the diffusion: the share of its neighbours' mean that a vertex takes on
 
 
@@ -46,13 +47,41 @@ def skin_from_run(run: Run, motion: Motion, settings: ExportSettings) -> Skinned
     surface = surface_through(points, normals, settings.skin_triangles)
     extent = float(np.ptp(points, axis=0).max())
     known = labels >= 0
-    nearest = cKDTree(points[known]).query(surface.vertices)[1]
-    nodes, weights = skin_weights(
-        surface, node_of_body(motion, labels[known])[nearest], motion.n_nodes, settings.skin_blend * extent
-    )
-    tint = colors if settings.skin_colors == "true" else colors[known]
-    near = cKDTree(points).query(surface.vertices)[1] if settings.skin_colors == "true" else nearest
-    return SkinnedMesh(surface.vertices, surface.normals, surface.triangles, tint[near], nodes, weights, frame)
+    body = majority(points[known], labels[known], surface.vertices)
+    nodes, weights = skin_weights(surface, node_of_body(motion, body), motion.n_nodes, settings.skin_blend * extent)
+    if settings.skin_colors == "true":
+        tint = colors[cKDTree(points).query(surface.vertices)[1]]
+    else:
+        tint = _body_tints(labels[known], colors[known])[body]
+    return SkinnedMesh(surface.vertices, surface.normals, surface.triangles, tint, nodes, weights, frame)
+
+
+def majority(points: np.ndarray, labels: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Label that most of the nearest points have, at each place, so that single wrong labels don't tear the skin.
+
+    Parameters
+    ----------
+    points : (N, 3) float
+    labels : (N,) int, 0 or more
+    places : (M, 3) float
+
+    Returns
+    -------
+    (M,) int
+    """
+    k = min(VOTERS, len(points))
+    nearest = cKDTree(points).query(places, k=k)[1].reshape(len(places), k)
+    votes = np.zeros((len(places), int(labels.max()) + 1), np.int16)
+    np.add.at(votes, (np.arange(len(places))[:, None], labels[nearest]), 1)
+    return votes.argmax(axis=1)
+
+
+def _body_tints(labels: np.ndarray, colors: np.ndarray) -> np.ndarray:
+    """Median colour of each body's points, (bodies, 3) uint8."""
+    tints = np.zeros((int(labels.max()) + 1, 3), np.uint8)
+    for b in np.unique(labels):
+        tints[b] = np.median(colors[labels == b], axis=0)
+    return tints
 
 
 def skin_weights(surface: Surface, node: np.ndarray, n_nodes: int, blend: float) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ from geomocap.export.errors import MotionError
 from geomocap.export.rotations import rotation_about
 from geomocap.export.settings import ExportSettings
 from geomocap.export.skeleton_motion import motion_from_skeleton
-from geomocap.export.skin import node_of_body, skin_from_run, skin_weights
+from geomocap.export.skin import majority, node_of_body, skin_from_run, skin_weights
 from geomocap.export.surface import Surface, point_spacing, shell_normals, surface_through
 from geomocap.run import Run
 
@@ -130,6 +130,16 @@ def test_weights_blend_as_wide_as_asked():
     middle = (y.ravel() >= 4) & (y.ravel() <= 7)
     expected = norm.cdf((vertices[:, 0] - 0.495) / blend)
     np.testing.assert_allclose(right[middle], expected[middle], atol=0.07)
+
+
+def test_single_wrong_labels_are_outvoted(arm_run):
+    points = arm_shell()
+    labels = (points[:, 0] > 0.5).astype(int)
+    wrong = labels.copy()
+    wrong[::10] = 2
+    away = np.abs(points[:, 0] - 0.5) > 0.05
+    np.testing.assert_array_equal(majority(points, wrong, points)[away], labels[away])
+    np.testing.assert_array_equal(majority(points[:4], labels[:4], points[:2]), labels[:2])
 
 
 def test_frames_and_points_that_make_no_skin(arm_run):
