@@ -126,7 +126,10 @@ class Skeleton:
         return self.body_positions[frame, body] if joint < 0 else self.joint_positions[frame, joint]
 
     def joint_rotations(self) -> np.ndarray:
-        """Return each joint's rotation since frame 0 as rotation vectors (T, J, 3), degrees, parent's axes."""
+        """Return each joint's rotation since frame 0 as rotation vectors (T, J, 3), degrees, parent's axes.
+
+        Of the vectors that mean the same rotation, that nearest to the frame before is taken: no jumps at 180°.
+        """
         from scipy.spatial.transform import Rotation
 
         parent = self.body_rotations[:, self.joint_bodies[:, 0]]
@@ -139,7 +142,7 @@ class Skeleton:
         vectors = np.full((len(flat), 3), np.nan)
         if whole.any():
             vectors[whole] = Rotation.from_matrix(flat[whole]).as_rotvec(degrees=True)
-        return vectors.reshape(*relative.shape[:2], 3)
+        return _continuous(vectors.reshape(*relative.shape[:2], 3))
 
 
 @dataclass(frozen=True)
@@ -223,8 +226,18 @@ class Results:
         return np.zeros((0, 3))
 
     def place(self, frame: int) -> int:
-        """Place of a frame number in the arrays over time."""
+        """Place of a frame number in the arrays over time.
+
+        Arrays that hold more frames than there are files (some were deleted) count from frame 0.
+        """
+        arrays = [len(a) for a in (self.skeleton and self.skeleton.joint_positions, self._centers) if a is not None]
+        if arrays and arrays[0] > len(self.frames):
+            return min(frame, arrays[0] - 1)
         return self.frames.index(frame) if frame in self.frames else 0
+
+    @property
+    def _centers(self) -> np.ndarray | None:
+        return None if self.ellipsoids is None else self.ellipsoids.centers
 
     @cached_property
     def counts(self) -> dict[str, np.ndarray]:
@@ -307,3 +320,15 @@ class Results:
 
 def _finite(points: np.ndarray) -> np.ndarray:
     return points[np.isfinite(points).all(axis=1)]
+
+
+def _continuous(vectors: np.ndarray) -> np.ndarray:
+    """Add whole turns to rotation vectors (T, J, 3), degrees, so that they stay near those of the frame before."""
+    vectors = vectors.copy()
+    for t in range(1, len(vectors)):
+        size = np.linalg.norm(vectors[t], axis=1, keepdims=True)
+        axis = vectors[t] / np.maximum(size, 1e-12)
+        turned = np.stack([vectors[t] + 360 * k * axis for k in (0, -1, 1)])
+        distance = np.nan_to_num(np.linalg.norm(turned - vectors[t - 1], axis=2), nan=0.0)
+        vectors[t] = np.take_along_axis(turned, distance.argmin(axis=0)[None, :, None], axis=0)[0]
+    return vectors

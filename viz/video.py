@@ -74,7 +74,7 @@ def best_camera(results: Results, stage: Stage) -> str | None:
 
 
 def motion_video(
-    results: Results, stage: Stage, path: Path, at_most: int = 120, progress: Progress = silent, turn_deg: float = 60.0
+    results: Results, stage: Stage, path: Path, at_most: int = 100, progress: Progress = silent, turn_deg: float = 60.0
 ) -> None:
     """Write the motion as a video: the bodies and the skeleton from a slowly turning view, and over a camera's image.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -11,6 +12,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError, RunError
 from geomocap.run import Run
@@ -272,3 +274,23 @@ def test_points_without_colours_or_bodies(tmp_path: Path) -> None:
     points = read_points(tmp_path / "a.ply")
     assert len(points.positions) == 2 and points.colors.shape == (2, 3)
     assert points.bodies is None and points.normals is None
+
+
+def test_joint_rotations_go_on_past_half_a_turn(made: Made) -> None:
+    skeleton = Results(made.run).skeleton
+    assert skeleton is not None
+    angles = np.radians(np.arange(0, 300, 30.0))
+    child = Rotation.from_rotvec(np.outer(angles, [0, 0, 1])).as_matrix()
+    rotations = np.stack([np.tile(np.eye(3), (10, 1, 1)), child], axis=1)
+    one = replace(skeleton, joint_bodies=np.array([[0, 1]]), body_rotations=rotations)
+    np.testing.assert_allclose(one.joint_rotations()[:, 0, 2], np.arange(0, 300, 30.0), atol=1e-9)
+
+
+def test_arrays_of_all_frames_fit_a_run_that_keeps_some_geometry(made: Made, tmp_path: Path) -> None:
+    shutil.copytree(made.run.path, tmp_path / "run")
+    for kind in ("voxels", "bodies"):
+        for frame in (0, 1, 3, 4):
+            Run(tmp_path / "run").frame_file(kind, frame).unlink()
+    results = Results(Run(tmp_path / "run"))
+    assert results.frames == [2, 5]
+    assert [results.place(f) for f in results.frames] == [2, 5]
