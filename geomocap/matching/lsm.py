@@ -286,6 +286,7 @@ def _match_all(
     count = len(points)
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
         work = workspace(radius, len(searches))
+        wanted = np.ones(len(searches), np.uint8)
         for n in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
             match_patch(
                 flat,
@@ -303,6 +304,7 @@ def _match_all(
                 tolerance,
                 minimum_contrast,
                 max_shift,
+                wanted,
                 position[n],
                 affine[n],
                 quality[n],

@@ -106,6 +106,7 @@ def match_patch(
     tolerance,
     minimum_contrast,
     max_shift,
+    wanted,
     position,
     affine,
     quality,
@@ -128,6 +129,8 @@ def match_patch(
         Least standard deviation of the template's grey levels.
     max_shift : float
         Farthest that a position may move from its start, pixels; 0: anywhere.
+    wanted : (K,) uint8
+        1 for the search images to match in.
     position : (K, 2) float, affine : (K, 4) float
         Start and result, changed in place.
     quality : (K, COLUMNS) float
@@ -166,8 +169,8 @@ def match_patch(
         return 0
     use = state[:, ACTIVE]
     for k in range(images):
-        quality[k, STATUS] = NOT_CONVERGED
-        use[k] = 1.0
+        use[k] = wanted[k]
+        quality[k, STATUS] = NOT_CONVERGED if wanted[k] else UNTRIED
         position[k, 0] -= affine[k, 0] * ox + affine[k, 1] * oy
         position[k, 1] -= affine[k, 2] * ox + affine[k, 3] * oy
         state[k, START_X] = position[k, 0]
@@ -207,8 +210,10 @@ def match_patch(
                 quality[k, STATUS] = CORRELATION
                 use[k] = 0.0
                 continue
+            # The residual stands on the search image, not on f: its share along f goes with the gain
+            share = correlation * correlation
             for i in range(6):
-                systems[k, 0, i] = gain * (b[i] - off * q1[i]) - qf[i]
+                systems[k, 0, i] = gain * (b[i] - off * q1[i]) - share * qf[i]
         # Solve: each image for itself, or all through the one unknown that they share, the inverse depth.
         step = 0.0
         if condition:

@@ -23,3 +23,42 @@ class KernelSettings(Settings):
     sigma_condition: float = Field(
         0.15, ge=0, description="standard deviation of the condition that all rays meet; 0: none (px)"
     )
+
+
+class SeedSettings(Settings):
+    """Where matching begins: interest points and the search along their epipolar lines."""
+
+    window: int = Field(7, ge=3, le=31, description="window of the interest operator, odd (px)")
+    minimum_weight: float = Field(0.1, ge=0, description="least w of an interest point, in means of w")
+    minimum_roundness: float = Field(0.3, ge=0, le=1, description="least q of an interest point")
+    cell: int = Field(10, ge=4, description="edge of the cells that have one interest point each (px)")
+    limit: int = Field(800, ge=1, description="most interest points")
+    radius: int = Field(8, ge=3, le=40, description="radius of the patches that are correlated (px)")
+    blur: float = Field(1.2, ge=0, description="smoothing before the search, standard deviation (px)")
+    step: float = Field(1.5, gt=0.1, description="step along the epipolar line (px)")
+    tilt: float = Field(0.8, ge=0, description="tangent of the tilts of the planes that are tried, both ways; 0: none")
+    correlation: float = Field(0.6, ge=-1, le=1, description="least correlation in every image")
+    uniqueness: float = Field(0.08, ge=0, description="least lead in correlation over any other place on the line")
+    agreement: float = Field(3.0, gt=0, description="farthest that the images' own best places may lie apart (px)")
+
+
+class GrowingSettings(Settings):
+    """How matching spreads from the seeds over the template image."""
+
+    step: float = Field(2.0, gt=0.25, description="distance of neighbouring points in the template image (px)")
+    order: Literal["best", "paper"] = Field(
+        "best", description="best: best neighbour first; paper: sequential horizontal and vertical shifts"
+    )
+    radius: int = Field(6, ge=2, le=40, description="patch radius (px)")
+    larger: float = Field(1.5, ge=1, description="growth of the patch where the quality is poor; 1: none")
+    minimum_correlation: float = Field(0.8, ge=-1, le=1, description="least correlation after matching")
+    pair_correlation: float = Field(0.9, ge=-1, le=1, description="the same if one search image alone saw the point")
+    maximum_sigma0: float = Field(30.0, gt=0, description="greatest a-posteriori sigma (grey levels after filtering)")
+    maximum_deviation: float = Field(0.2, gt=0, description="greatest standard deviation in x and in y (px)")
+    maximum_shift: float = Field(1.5, gt=0, description="farthest way from the start (px)")
+    seed_shift: float = Field(4.0, gt=0, description="the same for seeds, whose start is coarser (px)")
+    maximum_epipolar: float = Field(0.7, gt=0, description="greatest distance from the epipolar line (px)")
+    attempts: int = Field(3, ge=1, le=8, description="neighbours from which a point is tried")
+    hole_passes: int = Field(8, ge=0, description="rounds of filling holes from all directions")
+    agreement: float = Field(0.6, gt=0, description="greatest departure from what a neighbour predicts (px)")
+    minimum_patch: int = Field(40, ge=1, description="least number of points that hang together")

@@ -1,0 +1,134 @@
+"""Template groups: which camera is matched with which others, from the cameras' geometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geomocap.cameras import Rig
+from geomocap.cloud.settings import GroupSettings
+from geomocap.errors import CalibrationError
+from geomocap.matching.epipolar import transfers
+
+
+@dataclass(frozen=True)
+class MatchGroup:
+    """A template camera and its search cameras.
+
+    Attributes
+    ----------
+    template : int
+    searches : (K,) int
+    transfers : (K, 12) float
+        Their epipolar geometry (`matching.epipolar`).
+    near, far : float
+        Depths between which the scene lies, metres.
+    """
+
+    template: int
+    searches: np.ndarray
+    transfers: np.ndarray
+    near: float
+    far: float
+
+
+@dataclass(frozen=True)
+class MatchGroups:
+    """All that is computed once for a capture.
+
+    Attributes
+    ----------
+    rig : Rig
+        The pinhole cameras in whose images is matched (`Rig.undistorted`).
+    maps : tuple of (map_x, map_y) or None
+        Where their pixels come from; None for cameras without distortion.
+    groups : tuple of MatchGroup
+    """
+
+    rig: Rig
+    maps: tuple[tuple[np.ndarray, np.ndarray] | None, ...]
+    groups: tuple[MatchGroup, ...]
+
+
+def scene_center(rig: Rig) -> np.ndarray:
+    """Point nearest to all optical axes, (3,) float, metres, world."""
+    d = rig.viewing_directions
+    across = np.eye(3) - d[:, :, None] * d[:, None, :]
+    # Parallel axes leave their direction open: the point nearest to the cameras is taken then
+    A = across.sum(axis=0) + 1e-6 * np.eye(3)
+    return np.linalg.solve(A, (across @ rig.centers[:, :, None]).sum(axis=0)[:, 0] + 1e-6 * rig.centers.mean(axis=0))
+
+
+def match_groups(rig: Rig, settings: GroupSettings | None = None) -> MatchGroups:
+    """Choose templates and their search cameras.
+
+    A template is matched with cameras whose directions to the middle of the scene differ enough for precision and
+    little enough for likeness; the second lies, where it can, on another side than the first.
+
+    Parameters
+    ----------
+    rig : Rig
+        At least two cameras.
+    settings : GroupSettings, optional
+
+    Raises
+    ------
+    CalibrationError
+        If no camera has a neighbour within the angles allowed.
+    """
+    settings = settings or GroupSettings()
+    pinhole = rig.undistorted()
+    center = scene_center(rig)
+    rays = center - rig.centers
+    distance = np.linalg.norm(rays, axis=1)
+    rays /= distance[:, None]
+    angles = np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)))
+    groups = []
+    for t in _templates(rig, angles, settings):
+        searches = _searches(rig, t, angles, settings)
+        if len(searches):
+            T = transfers(pinhole, t, searches.tolist())
+            depth = float((center - rig.centers[t]) @ rig.viewing_directions[t])
+            groups.append(MatchGroup(t, searches, T, settings.near * depth, settings.far * depth))
+    if not groups:
+        off = angles[~np.eye(len(rig), dtype=bool)]
+        raise CalibrationError(
+            f"no two cameras can be matched: their viewing directions differ by "
+            f"{off.min(initial=180):.0f}° at least, expected {settings.least_angle:g}° to {settings.greatest_angle:g}°; "
+            "widen groups.least_angle and groups.greatest_angle or add cameras between"
+        )
+    maps = tuple(None if c.is_undistorted() else rig.undistortion_map(i) for i, c in enumerate(rig.cameras))
+    return MatchGroups(pinhole, maps, tuple(groups))
+
+
+def _templates(rig: Rig, angles: np.ndarray, settings: GroupSettings) -> list[int]:
+    if settings.template_camera is not None and settings.template_camera not in rig.names:
+        raise CalibrationError(f"template camera {settings.template_camera}: the rig has {', '.join(rig.names)}")
+    if settings.templates == "all" or (settings.templates == "auto" and len(rig) > 3):
+        return list(range(len(rig)))
+    if settings.template_camera is not None:
+        return [rig.names.index(settings.template_camera)]
+    return [int(np.argmin(angles.max(axis=1)))]
+
+
+def _searches(rig: Rig, template: int, angles: np.ndarray, settings: GroupSettings) -> np.ndarray:
+    """Choose search cameras of one template, best first."""
+    angle = angles[template]
+    possible = [
+        i
+        for i in range(len(rig))
+        if i != template and settings.least_angle <= angle[i] <= settings.greatest_angle
+    ]
+    # Directions in which the other cameras lie, seen from the template
+    side = (rig.centers - rig.centers[template]) @ rig.cam_from_world[template, :2, :3].T
+    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-12)
+    chosen: list[int] = []
+    while possible and len(chosen) < settings.searches:
+        # On another side than those chosen, and near the angle aimed at
+        crowded = [max((float(side[i] @ side[j]) for j in chosen), default=-1.0) for i in possible]
+        cost = [abs(np.log(angle[i] / settings.best_angle)) + max(c, 0.0) for i, c in zip(possible, crowded, strict=True)]
+        best = possible[int(np.argmin(cost))]
+        chosen.append(best)
+        possible.remove(best)
+    return np.array(chosen, dtype=np.int64)
