@@ -230,14 +230,11 @@ class Results:
 
         Arrays that hold more frames than there are files (some were deleted) count from frame 0.
         """
-        arrays = [len(a) for a in (self.skeleton and self.skeleton.joint_positions, self._centers) if a is not None]
-        if arrays and arrays[0] > len(self.frames):
-            return min(frame, arrays[0] - 1)
+        lengths = [len(s.joint_positions) for s in (self.skeleton,) if s is not None]
+        lengths += [len(e.centers) for e in (self.ellipsoids,) if e is not None]
+        if lengths and lengths[0] > len(self.frames):
+            return min(frame, lengths[0] - 1)
         return self.frames.index(frame) if frame in self.frames else 0
-
-    @property
-    def _centers(self) -> np.ndarray | None:
-        return None if self.ellipsoids is None else self.ellipsoids.centers
 
     @cached_property
     def counts(self) -> dict[str, np.ndarray]:
