@@ -8,6 +8,7 @@ import numpy as np
 
 from geomocap.export.errors import MotionError
 from geomocap.export.motion import Motion
+from geomocap.palette import body_colors
 
 CORNERS = 24  # of a bone's eight triangles
 INFLUENCES = 4  # nodes that may move a vertex, as glTF's JOINTS_0 holds them
@@ -81,7 +82,7 @@ def bone_mesh(motion: Motion, thickness: float = 0.12) -> SkinnedMesh:
     carrier[:, 0] = np.repeat([node for node, _, _ in bones], CORNERS)
     weights = np.zeros((len(corners), INFLUENCES))
     weights[:, 0] = 1
-    colors = body_colors(motion.n_nodes)[carrier[:, 0]]
+    colors = body_colors(motion.bodies)[carrier[:, 0]]
     return SkinnedMesh(corners, np.repeat(normal, 3, axis=0), faces, colors, carrier, weights)
 
 
@@ -111,12 +112,3 @@ def _octahedron(start: np.ndarray, end: np.ndarray, thickness: float) -> np.ndar
         a, b = waist[k], waist[(k + 1) % 4]
         corners += [start, b, a, end, a, b]
     return np.array(corners)
-
-
-def body_colors(n: int) -> np.ndarray:
-    """Colours (n, 3) uint8, RGB, far from each other, hue stepping by the golden ratio."""
-    hue = (0.05 + 0.618034 * np.arange(n)) % 1.0
-    k = (np.array([0.0, 8.0, 4.0]) + 12 * hue[:, None]) % 12
-    value = np.where(np.arange(n) % 3 == 1, 0.72, 0.92)[:, None]
-    rgb = value * (1 - 0.7 * np.clip(np.minimum(k - 3, 9 - k), 0, 1))
-    return np.rint(255 * rgb).astype(np.uint8)
