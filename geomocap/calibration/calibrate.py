@@ -122,6 +122,8 @@ class Calibration:
     held_out : HeldOut
     moved : tuple of Moved
     verdict : Verdict
+    up : {"x", "y", "z"}
+        Axis of the world that points up.
     """
 
     rig: Rig
@@ -137,6 +139,7 @@ class Calibration:
     held_out: HeldOut
     moved: tuple[Moved, ...]
     verdict: Verdict
+    up: str
 
     @property
     def sigma0(self) -> float:
@@ -330,4 +333,5 @@ def calibrate_bar(
         lengths,
         moved,
         verdict,
+        world.up,
     )

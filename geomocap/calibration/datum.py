@@ -66,7 +66,7 @@ def datum_from_axes(
     """
     u = up_direction / np.linalg.norm(up_direction)
     f = forward - u * float(np.dot(u, forward))
-    if np.linalg.norm(f) < 1e-6 * max(np.linalg.norm(forward), 1e-12):
+    if np.linalg.norm(f) < 1e-6 * max(float(np.linalg.norm(forward)), 1e-12):
         f = np.cross(u, np.eye(3)[int(np.argmin(np.abs(u)))])
     f = f / np.linalg.norm(f)
     k = AXES[up]

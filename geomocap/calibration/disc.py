@@ -57,6 +57,38 @@ def blurred_disc(r, R, s):
 
 
 @njit(cache=True, nogil=True)
+def _drop_surroundings(image, u, part, x0, y0):
+    """Take pixels out of `part` that lie outside the target and contradict the background; return how many."""
+    m0, m1, m2 = 1.0 + u[5], u[6], 1.0 - u[5]
+    rows, columns = part.shape
+    errors = np.empty(rows * columns)
+    count = 0
+    for step in range(2):
+        limit = 0.0
+        if step == 1:
+            if count < 12:
+                return 0
+            limit = 4.0 * 1.4826 * np.median(np.abs(errors[:count]))
+        dropped = 0
+        for i in range(rows):
+            for j in range(columns):
+                if not part[i, j]:
+                    continue
+                dx, dy = x0 + j - u[0], y0 + i - u[1]
+                p, q = m0 * dx + m1 * dy, m1 * dx + m2 * dy
+                if math.sqrt(p * p + q * q) < u[3] + 3.0 * u[4] + 0.5:
+                    continue
+                e = image[y0 + i, x0 + j] - (u[7] + u[8] * dx + u[9] * dy)
+                if step == 0:
+                    errors[count] = e
+                    count += 1
+                elif abs(e) > limit:
+                    part[i, j] = False
+                    dropped += 1
+    return dropped
+
+
+@njit(cache=True, nogil=True)
 def fit_disc(image, x, y, radius, blur, reach, saturation, result):
     """Fit the target model to an image around a first guess (Levenberg–Marquardt).
 
@@ -119,7 +151,8 @@ def fit_disc(image, x, y, radius, blur, reach, saturation, result):
     damping = 1e-2
     iteration = 0
     last_step = 1e9
-    while iteration < 40:
+    cleaned = False
+    while iteration < 60:
         iteration += 1
         N[:] = 0.0
         b[:] = 0.0
@@ -163,6 +196,17 @@ def fit_disc(image, x, y, radius, blur, reach, saturation, result):
             best_b[:] = b
             damping = max(damping * 0.1, 1e-9)
             if last_step < 1e-4 or gain < 1e-9:
+                if cleaned:
+                    break
+                # Once: leave out what is bright or dark beside the target (the bar itself, other lights)
+                cleaned = True
+                dropped = _drop_surroundings(image, u, part, x0, y0)
+                if dropped > 0 and n - dropped >= 14:
+                    n -= dropped
+                    cost = np.inf
+                    damping = 1e-3
+                    last_step = 1e9
+                    continue
                 break
         else:
             damping *= 10
