@@ -9,6 +9,7 @@ from typing import Any
 from pydantic import Field
 
 from geomocap.carving.settings import CarvingSettings
+from geomocap.cloud.settings import CloudSettings
 from geomocap.errors import SettingsError
 from geomocap.export.settings import ExportSettings
 from geomocap.scans import ScanSettings
@@ -23,6 +24,7 @@ class Config(Settings):
 
     silhouettes: SilhouetteSettings = Field(SilhouetteSettings(), description="silhouettes")
     carving: CarvingSettings = Field(CarvingSettings(), description="space carving")
+    cloud: CloudSettings = Field(CloudSettings(), description="surface measurement by least squares matching")
     scans: ScanSettings = Field(ScanSettings(), description="reading of scans")
     segmentation: SegmentationSettings = Field(SegmentationSettings(), description="bodies")
     skeleton: SkeletonSettings = Field(SkeletonSettings(), description="joints and hierarchy")

@@ -130,6 +130,22 @@ class BodyPoints:
         return cls(cloud.point.positions.numpy().astype(np.float64), cloud.point["body"].numpy().ravel())
 
 
+def read_cloud(path: Path) -> np.ndarray:
+    """Read the positions of a point cloud file, (N, 3) float, in the file's order.
+
+    Raises
+    ------
+    GeometryError
+        If the file is missing or holds no points.
+    """
+    if not path.is_file():
+        raise GeometryError(f"{path}: no such point cloud")
+    cloud = o3d.t.io.read_point_cloud(path)
+    if "positions" not in cloud.point or not len(cloud.point.positions):
+        raise GeometryError(f"{path}: holds no points; delete it and run again")
+    return cloud.point.positions.numpy().astype(np.float64)
+
+
 _HEADER = b"""ply
 format binary_little_endian 1.0
 comment Created by Open3D

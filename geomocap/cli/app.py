@@ -10,6 +10,7 @@ import typer
 import geomocap
 from geomocap import pipeline
 from geomocap.cli import captures
+from geomocap.cli.calibrate import calibrate
 from geomocap.cli.evaluate import evaluate
 from geomocap.cli.execution import Scheduler, Workers
 from geomocap.cli.export import export
@@ -74,6 +75,16 @@ def voxels(
 
 
 @app.command()
+@with_settings("silhouettes", "carving", "cloud")
+def cloud(
+    capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
+) -> None:
+    """Measure the surface by least squares matching: a dense point cloud for each frame."""
+    with capture_job(capture, run, config, workers, scheduler) as job:
+        pipeline.clouds(job)
+
+
+@app.command()
 @with_settings("scans", "segmentation", "skeleton", "export")
 def segment(
     scans: Annotated[
@@ -95,12 +106,12 @@ def segment(
 
 
 @app.command()
-@with_settings("silhouettes", "carving", "segmentation", "skeleton", "export")
+@with_settings("silhouettes", "carving", "cloud", "segmentation", "skeleton", "export")
 def run(
     capture: CaptureFolder,
     run: RunFolder,
     config: Config,
-    source: Annotated[Literal["voxels"], typer.Option("--source", help="Geometry to work from.")] = "voxels",
+    source: Annotated[Literal["voxels", "cloud"], typer.Option("--source", help="Geometry to work from.")] = "voxels",
     pictures: Pictures = True,
     workers: Workers = None,
     scheduler: Scheduler = None,
@@ -143,6 +154,7 @@ def render(
 app.command()(captures.synthesize)
 app.command("import")(captures.import_)
 app.command()(captures.demo)
+app.command()(calibrate)
 app.command()(export)
 app.command()(evaluate)
 app.command()(info)

@@ -8,16 +8,18 @@ from typing import Literal, Protocol
 import numpy as np
 
 from geomocap.errors import GeometryError
-from geomocap.geometry import BodyPoints, Voxels
+from geomocap.geometry import BodyPoints, Voxels, read_cloud
+from geomocap.pipeline.clouds import clouds
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.voxels import voxels
 from geomocap.run import Run, stage_key
+from geomocap.scans import point_spacing
 from geomocap.scheduling import map_items
 from geomocap.segmentation.m3 import segment_m3
 from geomocap.segmentation.segmentation import Segmentation
 from geomocap.skeleton.skeleton import skeleton_m3
 
-Source = Literal["voxels", "scans"]
+Source = Literal["voxels", "cloud", "scans"]
 
 
 class Geometry(Protocol):
@@ -55,15 +57,36 @@ class VoxelFrames:
         return Voxels.read(self.run.frame_file("voxels", frame)).points
 
 
+@dataclass(frozen=True)
+class CloudFrames:
+    """The measured surface points of a run."""
+
+    run: Run
+    frames: int
+
+    @property
+    def spacing(self) -> float:
+        """Mean distance of a point of the first cloud from its nearest neighbour, metres."""
+        return point_spacing(self.points(0))
+
+    def __len__(self) -> int:
+        return self.frames
+
+    def points(self, frame: int) -> np.ndarray:
+        """Points of one frame, (N, 3) float, metres, world."""
+        return read_cloud(self.run.frame_file("cloud", frame))
+
+
 def geometry_of(job: Job, source: Source) -> tuple[Geometry, str]:
     """Make the geometry that a source names, and return it with the key of the stage that made it."""
     if source == "scans":
         if job.scans is None:
             raise GeometryError("no scans were given")
         return job.scans, stage_key("scans", job.scans.fingerprint(), job.config.scans.model_dump())
-    key = voxels(job)
+    key = voxels(job) if source == "voxels" else clouds(job)
     assert job.capture is not None
-    return VoxelFrames(job.run, job.capture.n_frames), key
+    frames = job.capture.n_frames
+    return VoxelFrames(job.run, frames) if source == "voxels" else CloudFrames(job.run, frames), key
 
 
 def segment(job: Job, source: Source) -> str:
