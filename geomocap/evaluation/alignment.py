@@ -25,7 +25,7 @@ CANDIDATE_OFFSETS = 10
 ROUNDS, FEW_ROUNDS = 30, 8
 FEW_FRAMES = 24
 KEPT_STARTS = 2  # of the 24
-TIE, TIE_M = 0.2, 0.002  # fits that are worse by no more than this are as good as the best
+TIE, TIE_M = 0.05, 0.002  # fits that are worse by no more than this are as good as the best
 START_LIMIT, END_LIMIT = 0.5, 0.15  # shares of the extent within which trajectories match, narrowing
 FEWEST_FRAMES = 3
 
