@@ -1,0 +1,139 @@
+"""What tracking needs of one frame: blurred grey images, silhouettes and the depth of the surface in every camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from geomocap.carving.grid import Grid
+from geomocap.carving.views import PinholeViews
+from geomocap.carving.visibility import SurfaceVoxels, depth_buffers
+from geomocap.errors import GeometryError
+from geomocap.geometry import Voxels
+
+_ALL_FACES = 63
+_EMPTY = 1e-3  # share of subject under the blur below which a pixel has no value
+
+
+@dataclass(frozen=True)
+class FrameViews:
+    """One frame as the pinhole cameras see it.
+
+    Attributes
+    ----------
+    levels : (L, C, H, W) float32
+        Grey images without background, blurred, coarsest first.
+    masks : (C, H, W) uint8
+        1 where the subject is.
+    depth : (C, H, W) float32
+        Depth of the surface along the optical axis, metres; inf where there is none.
+    projections : (C, 3, 4) float
+        World metres to *array indices* (COLMAP pixel minus 0.5), third row of unit length: it gives the depth.
+    centers : (C, 3) float
+        Camera centres, metres, world.
+    surface : (M, 3) float
+        Centres of the surface voxels, metres, world.
+    voxel_size : float, metres
+    """
+
+    levels: np.ndarray
+    masks: np.ndarray
+    depth: np.ndarray
+    projections: np.ndarray
+    centers: np.ndarray
+    surface: np.ndarray
+    voxel_size: float
+
+    @classmethod
+    def of(
+        cls, views: PinholeViews, images: np.ndarray, voxels: Voxels, blurs_px: Sequence[float] = (2.5, 0.8)
+    ) -> FrameViews:
+        """Prepare a frame.
+
+        Parameters
+        ----------
+        views : PinholeViews
+            Undistorted silhouettes.
+        images : (C, H, W, 3) uint8
+            Undistorted images on the same canvas.
+        voxels : Voxels
+            Surface of the subject.
+        blurs_px : sequence of float
+            Standard deviations of the Gaussian blurs, coarsest first, pixels.
+
+        Raises
+        ------
+        GeometryError
+            If the images don't fit the silhouettes, or there is no surface.
+        """
+        C, H, W = views.masks.shape
+        if images.shape != (C, H, W, 3):
+            raise GeometryError(f"images have shape {images.shape}, their silhouettes {views.masks.shape}")
+        if not len(voxels.indices):
+            raise GeometryError("a frame without surface voxels can't be tracked; carve it again")
+        P = views.projections / np.linalg.norm(views.projections[:, 2:, :3], axis=2, keepdims=True)
+        P = P * np.sign(np.linalg.det(P[:, :, :3]))[:, None, None]
+        P[:, :2] -= 0.5 * P[:, 2:]
+        levels = np.zeros((len(blurs_px), C, H, W), np.float32)
+        for c in range(C):
+            _blur(images[c], views.masks[c], blurs_px, levels[:, c])
+        low = voxels.indices.min(axis=0)
+        top = voxels.indices.max(axis=0) + 1 - low
+        shape = (int(top[0]), int(top[1]), int(top[2]))
+        grid = Grid(np.asarray(voxels.origin) + low * voxels.voxel_size, voxels.voxel_size, shape)
+        indices = np.ascontiguousarray(voxels.indices - low, np.int32)
+        depth = depth_buffers(views, grid, SurfaceVoxels(indices, np.full(len(indices), _ALL_FACES, np.uint8)))
+        centers = -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[:, :, 0]
+        return cls(
+            levels, views.masks, depth, np.ascontiguousarray(P), centers, voxels.points, float(voxels.voxel_size)
+        )
+
+    @property
+    def count(self) -> int:
+        """Number of cameras C."""
+        return len(self.masks)
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Project world points (N, 3): array indices x, y (N, C, 2) and depths (N, C), metres."""
+        image = np.einsum("cij,nj->nci", self.projections[:, :, :3], points) + self.projections[:, :, 3]
+        depth = image[:, :, 2]
+        safe = np.where(depth > 0, depth, np.nan)
+        return image[:, :, :2] / safe[:, :, None], depth
+
+    def pixel_size(self, points: np.ndarray) -> np.ndarray:
+        """Return the length that one pixel covers at world points (N, 3) in each camera: (N, C) float, metres."""
+        focal = np.sqrt(np.abs(np.linalg.det(self.projections[:, :, :3])))
+        depth = np.einsum("cj,nj->nc", self.projections[:, 2, :3], points) + self.projections[:, 2, 3]
+        return np.maximum(depth, 0.0) / focal
+
+    def surface_depth(self, points: np.ndarray) -> np.ndarray:
+        """Return the surface's depth at the pixels that show world points (N, 3): (N, C), NaN where none is seen."""
+        pixel, _ = self.project(points)
+        C, H, W = self.masks.shape
+        inside = np.isfinite(pixel).all(axis=2)
+        column = np.rint(np.where(inside, pixel[:, :, 0], -1)).clip(-1, W).astype(np.int64)
+        row = np.rint(np.where(inside, pixel[:, :, 1], -1)).clip(-1, H).astype(np.int64)
+        inside &= (column >= 0) & (row >= 0) & (column < W) & (row < H)
+        found = self.depth[np.arange(C), row.clip(0, H - 1), column.clip(0, W - 1)].astype(np.float64)
+        return np.where(inside & np.isfinite(found), found, np.nan)
+
+
+def _blur(image: np.ndarray, mask: np.ndarray, blurs_px: Sequence[float], out: np.ndarray) -> None:
+    """Blur the subject without its background into `out` (L, H, W); 0 far from it."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return
+    margin = int(np.ceil(4 * max(blurs_px))) + 1
+    part = (
+        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + margin + 1),
+        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + margin + 1),
+    )
+    inside = mask[part].astype(np.float32)
+    grey = cv2.cvtColor(np.ascontiguousarray(image[part]), cv2.COLOR_RGB2GRAY).astype(np.float32) * inside
+    for level, blur in enumerate(blurs_px):
+        weight = cv2.GaussianBlur(inside, (0, 0), blur)
+        value = cv2.GaussianBlur(grey, (0, 0), blur)
+        out[(level, *part)] = np.where(weight > _EMPTY, value / np.maximum(weight, _EMPTY), 0.0)

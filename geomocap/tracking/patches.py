@@ -1,0 +1,260 @@
+"""Patches of the surface: small curved pieces with a place, a shape and a template in each camera that saw them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from geomocap.tracking.frame_views import FrameViews
+from geomocap.tracking.patch_kernel import align_patches, take_templates
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """What aligning patches with a frame found; leading axis N patches.
+
+    Attributes
+    ----------
+    positions : (N, 3) float, metres, world
+    frames : (N, 3, 3) float
+        World from patch frame, rotations.
+    correlation : (N,) float
+        Mean over the cameras used, −1 without any.
+    n_views : (N,) int
+        Cameras whose correlation is good enough.
+    sigma : (N,) float
+        Standard deviation of a coordinate, metres: root mean square of the three axes; inf without solution.
+    by_camera : (N, C) float
+        Correlation in each camera, −1 where it has no part.
+    """
+
+    positions: np.ndarray
+    frames: np.ndarray
+    correlation: np.ndarray
+    n_views: np.ndarray
+    sigma: np.ndarray
+    by_camera: np.ndarray
+
+    def replaced(self, where: np.ndarray, other: Alignment) -> Alignment:
+        """Return this alignment with that of `other` at some patches, (N,) bool."""
+        parts = {}
+        for field in fields(self):
+            mine, new = getattr(self, field.name), getattr(other, field.name)
+            parts[field.name] = np.where(where.reshape((-1,) + (1,) * (mine.ndim - 1)), new, mine)
+        return Alignment(**parts)
+
+
+@dataclass(frozen=True)
+class Patches:
+    """N patches with M samples each, ready to be looked for by C cameras.
+
+    Attributes
+    ----------
+    positions : (N, 3) float, metres, world
+        Where they are now.
+    frames : (N, 3, 3) float
+        World from patch frame, rotations; third axis: outward normal.
+    shape : (N, M, 5) float
+        Samples in the patch's frame and slopes of the surface there: s, t, z (m), ∂z/∂s, ∂z/∂t.
+    size : (N,) float
+        Spacing of the samples: about a pixel, metres.
+    templates : (N, C, L, M, 3) float32
+        Grey level and its slopes along s and t, for each camera and blur level.
+    usable : (N, C, M) uint8
+        Samples that the template has.
+    has : (N, C) bool
+        Cameras with a template.
+    hidden : (N, C) float
+        Depth of the patch beyond the (hull's) surface when its template was taken, metres; NaN where there is none.
+    """
+
+    positions: np.ndarray
+    frames: np.ndarray
+    shape: np.ndarray
+    size: np.ndarray
+    templates: np.ndarray
+    usable: np.ndarray
+    has: np.ndarray
+    hidden: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @classmethod
+    def empty(cls, n_samples: int, n_cameras: int, n_levels: int) -> Patches:
+        """Return no patches."""
+        M, C, L = n_samples, n_cameras, n_levels
+        return cls.without_templates(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, M, 5)), np.zeros(0), C, L)
+
+    @classmethod
+    def without_templates(
+        cls, positions: np.ndarray, frames: np.ndarray, shape: np.ndarray, size: np.ndarray, C: int, L: int
+    ) -> Patches:
+        """Return patches that no camera has a template of yet."""
+        N, M = shape.shape[:2]
+        return cls(
+            np.array(positions, np.float64),
+            np.array(frames, np.float64),
+            shape,
+            size,
+            np.zeros((N, C, L, M, 3), np.float32),
+            np.zeros((N, C, M), np.uint8),
+            np.zeros((N, C), bool),
+            np.full((N, C), np.nan),
+        )
+
+    def select(self, which: np.ndarray) -> Patches:
+        """Return some of them, by a mask or by positions."""
+        return Patches(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
+
+    def join(self, other: Patches) -> Patches:
+        """Return these followed by others."""
+        return Patches(
+            **{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)}
+        )
+
+    def moved(self, positions: np.ndarray, frames: np.ndarray) -> Patches:
+        """Return them at other places."""
+        parts = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Patches(**(parts | {"positions": positions, "frames": frames}))
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Outward normals, (N, 3) float, world."""
+        return self.frames[:, :, 2]
+
+
+def visible(
+    patches: Patches, positions: np.ndarray, frames: np.ndarray, view: FrameViews, slack: np.ndarray, facing: float
+) -> np.ndarray:
+    """Find which cameras see patches at given places: (N, C) bool.
+
+    A camera sees a patch that is turned to it if the subject's surface doesn't lie nearer by more than `slack` than it
+    did when the template was taken: a hull stands off the true surface.
+
+    Parameters
+    ----------
+    patches : Patches
+    positions, frames : (N, 3), (N, 3, 3) float
+    view : FrameViews
+    slack : (N, 1) float, metres
+    facing : float
+        Least cosine between normal and direction to the camera.
+    """
+    _, depth = view.project(positions)
+    surface = view.surface_depth(positions)
+    return (facings(positions, frames[:, :, 2], view) > facing) & (
+        depth - surface - np.nan_to_num(np.maximum(patches.hidden, 0.0)) < slack
+    )
+
+
+def facings(positions: np.ndarray, normals: np.ndarray, view: FrameViews) -> np.ndarray:
+    """Return the cosines between normals and the directions to the cameras: (N, C) float."""
+    ray = view.centers[None] - positions[:, None]
+    return np.einsum("nci,ni->nc", ray, normals) / np.linalg.norm(ray, axis=2)
+
+
+def with_templates(patches: Patches, want: np.ndarray, view: FrameViews) -> Patches:
+    """Take templates in the cameras `want` (N, C) bool; patches that a camera sees too little of stay without."""
+    took = np.ascontiguousarray(want, np.uint8)
+    templates, usable = patches.templates.copy(), patches.usable.copy()
+    take_templates(
+        patches.positions,
+        patches.frames,
+        patches.shape,
+        took,
+        view.levels,
+        view.masks,
+        view.projections,
+        templates,
+        usable,
+    )
+    got = took != 0
+    hidden = view.project(patches.positions)[1] - view.surface_depth(patches.positions)
+    return Patches(
+        patches.positions,
+        patches.frames,
+        patches.shape,
+        patches.size,
+        np.where(got[:, :, None, None, None], templates, patches.templates),
+        np.where(got[:, :, None], usable, patches.usable),
+        patches.has | got,
+        np.where(got, hidden, patches.hidden),
+    )
+
+
+def align(
+    patches: Patches,
+    which: np.ndarray,
+    positions: np.ndarray,
+    frames: np.ndarray,
+    use: np.ndarray,
+    view: FrameViews,
+    *,
+    iterations: tuple[int, ...],
+    least_correlation: float,
+    prior: tuple[np.ndarray, np.ndarray] | None = None,
+    prior_shift_px: float = 30.0,
+    prior_turn: float = 0.4,
+) -> Alignment:
+    """Align patches with a frame, from the coarsest level to the finest.
+
+    Parameters
+    ----------
+    patches : Patches
+    which : (A,) int
+        Patches to align; the others keep the given places.
+    positions, frames : (N, 3), (N, 3, 3) float
+        Places to start from.
+    use : (N, C) bool
+        Cameras to use.
+    view : FrameViews
+    iterations : tuple of int
+        Most iterations on each level, from the coarsest; a level with −1 is left out, 0 compares only.
+    least_correlation : float
+        A camera counts from here on.
+    prior : pair of (N, 3), (N, 3, 3) float, optional
+        Where the patches are expected; the start if not given.
+    prior_shift_px, prior_turn : float
+        Standard deviation of that, in units of the patches' sample spacing, and radians.
+    """
+    X, Q = np.array(positions, np.float64), np.array(frames, np.float64)
+    N, C = use.shape
+    correlation = np.full((N, C), -1.0)
+    covariance = np.full((N, 6), np.nan)
+    expected = (X.copy(), Q.copy()) if prior is None else prior
+    for level, count in enumerate(iterations):
+        if count < 0:
+            continue
+        align_patches(
+            which,
+            X,
+            Q,
+            patches.shape,
+            patches.size,
+            patches.templates,
+            patches.usable,
+            np.ascontiguousarray(use, np.uint8),
+            view.levels[level],
+            level,
+            view.masks,
+            level == len(view.levels) - 1,
+            view.projections,
+            view.centers,
+            expected[0],
+            expected[1],
+            prior_shift_px * patches.size,
+            np.full(N, prior_turn),
+            count,
+            least_correlation,
+            correlation,
+            covariance,
+        )
+    counted = correlation >= least_correlation
+    part = correlation > -1
+    mean = np.where(part, correlation, 0).sum(axis=1) / np.maximum(part.sum(axis=1), 1)
+    best = np.where(counted, correlation, 0).sum(axis=1) / np.maximum(counted.sum(axis=1), 1)
+    score = np.where(part.any(axis=1), np.where(counted.any(axis=1), best, mean), -1.0)
+    sigma = np.sqrt(covariance[:, :3].mean(axis=1))
+    return Alignment(X, Q, score, counted.sum(axis=1), np.where(np.isfinite(sigma), sigma, np.inf), correlation)

@@ -1,0 +1,212 @@
+"""New patches: spread evenly over the surface, shaped like it, and put where at least two cameras agree on it."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from geomocap.tracking.frame_views import FrameViews
+from geomocap.tracking.patches import Patches, align, facings, with_templates
+from geomocap.tracking.tracking_settings import TrackingSettings
+
+_FIT_VOXELS = 4.5  # radius of the piece of surface that gives a patch its shape, voxels
+_FACING = 0.35
+_HULL_SLACK = 3.0  # voxels that a seed may lie behind the drawn surface
+_SWEEP_PX = 1.0  # step of the search along the viewing ray, pixels
+
+
+def seed_spacing(view: FrameViews, n_patches: int) -> float:
+    """Return the distance of seeds, metres, at which about `n_patches` cover the surface of a frame."""
+    area = 0.75 * len(view.surface) * view.voxel_size**2  # a slanted surface has more voxels than squares
+    return float(np.sqrt(area / (0.8 * n_patches)))
+
+
+def spread(points: np.ndarray, spacing: float, taken: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Choose points (M, 3), `spacing` from each other and 0.9 of it from those `taken` (K, 3): indices, sorted."""
+    free = np.ones(len(points), bool)
+    if len(taken):
+        free = cKDTree(taken).query(points)[0] > 0.9 * spacing
+    order = rng.permutation(np.flatnonzero(free))
+    if not len(order):
+        return order
+    near = cKDTree(points[order]).query_ball_point(points[order], spacing, return_sorted=False)
+    dead = np.zeros(len(order), bool)
+    keep = []
+    for i, neighbours in enumerate(near):
+        if not dead[i]:
+            keep.append(order[i])
+            dead[neighbours] = True
+    return np.sort(np.array(keep))
+
+
+def surface_frames(view: FrameViews, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fit a paraboloid to the surface voxels round points.
+
+    Parameters
+    ----------
+    view : FrameViews
+    points : (N, 3) float, metres, world
+
+    Returns
+    -------
+    positions : (N, 3) float
+        The points moved onto the fitted surface along its normal.
+    frames : (N, 3, 3) float
+        World from patch frame; third axis: outward normal.
+    curvature : (N, 3) float
+        a, b, c of z = a s² + b s t + c t², per metre.
+    """
+    tree = cKDTree(view.surface)
+    radius = _FIT_VOXELS * view.voxel_size
+    outward = _outward(view, points, tree)
+    positions, frames, curvature = np.array(points, float), np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+    for n, found in enumerate(tree.query_ball_point(points, radius, return_sorted=True)):
+        away = view.surface[found] - points[n]
+        _, axes = np.linalg.eigh(away.T @ away - len(away) * np.outer(away.mean(0), away.mean(0)))
+        normal = axes[:, 0] * (1.0 if axes[:, 0] @ outward[n] >= 0 else -1.0)
+        for _ in range(2):
+            frame = _frame_of(normal)
+            s, t, z = (away @ frame).T
+            near = np.abs(z) < 0.6 * radius  # not the other side of a thin limb
+            design = np.stack([np.ones_like(s), s, t, s * s, s * t, t * t], axis=1)
+            ridge = np.diag([0, 0, 0, 1, 1, 1]) * (0.05 * radius**4 * near.sum())
+            weighted = design * near[:, None]
+            fit = np.linalg.solve(weighted.T @ design + ridge + 1e-12 * np.eye(6), weighted.T @ z)
+            normal = frame @ np.array([-fit[1], -fit[2], 1.0])
+            normal /= np.linalg.norm(normal)
+        positions[n] += fit[0] * frame[:, 2]
+        frames[n] = frame
+        curvature[n] = np.clip(fit[3:], -0.25 / radius, 0.25 / radius)
+    return positions, frames, curvature
+
+
+def patch_shape(curvature: np.ndarray, size: np.ndarray, radius_px: int) -> np.ndarray:
+    """Return samples of patches on a square grid: (N, M, 5) s, t, z (m), ∂z/∂s, ∂z/∂t.
+
+    Parameters
+    ----------
+    curvature : (N, 3) float, per metre
+    size : (N,) float
+        Spacing of the samples, metres.
+    radius_px : int
+        M = (2 radius_px + 1)² samples.
+    """
+    steps = np.arange(-radius_px, radius_px + 1)
+    s, t = (np.outer(size, g.ravel()) for g in np.meshgrid(steps, steps))
+    a, b, c = (curvature[:, k, None] for k in range(3))
+    return np.stack([s, t, a * s * s + b * s * t + c * t * t, 2 * a * s + b * t, b * s + 2 * c * t], axis=2)
+
+
+def seed_patches(
+    view: FrameViews, taken: np.ndarray, spacing: float, settings: TrackingSettings, rng: np.random.Generator
+) -> Patches:
+    """Place new patches where a frame's surface has none.
+
+    Parameters
+    ----------
+    view : FrameViews
+    taken : (K, 3) float
+        Positions of patches that are there already, metres, world.
+    spacing : float
+        Distance of patches, metres.
+    settings : TrackingSettings
+    rng : numpy.random.Generator
+    """
+    C, L = view.count, len(view.levels)
+    chosen = spread(view.surface, spacing, taken, rng)
+    if not len(chosen):
+        return Patches.empty((2 * settings.radius_px + 1) ** 2, C, L)
+    positions, frames, curvature = surface_frames(view, view.surface[chosen])
+    # a patch belongs to the camera that faces it best; it needs a second one
+    cosine = facings(positions, frames[:, :, 2], view)
+    seen = _seen(view, positions) & (cosine > _FACING)
+    good = seen.sum(axis=1) >= settings.n_views
+    positions, frames, curvature, cosine, seen = (a[good] for a in (positions, frames, curvature, cosine, seen))
+    reference = np.where(seen, cosine, -1).argmax(axis=1)
+    rows = np.arange(len(positions))
+    size = view.pixel_size(positions)[rows, reference]
+    blank = Patches.without_templates(positions, frames, patch_shape(curvature, size, settings.radius_px), size, C, L)
+    only = np.zeros((len(blank), C), bool)
+    only[rows, reference] = True
+    patches = with_templates(blank, only, view)
+    keep = patches.has.any(axis=1)
+    patches, seen, reference = patches.select(keep), seen[keep], reference[keep]
+    return _lock(patches, seen, reference, view, settings)
+
+
+def _lock(
+    patches: Patches, seen: np.ndarray, reference: np.ndarray, view: FrameViews, settings: TrackingSettings
+) -> Patches:
+    """Sweep patches along the reference camera's ray, align them there, and take every camera's own template."""
+    N, C = seen.shape
+    rows, every = np.arange(N), np.arange(N)
+    # all cameras look for what the reference camera saw
+    shared = Patches(
+        patches.positions,
+        patches.frames,
+        patches.shape,
+        patches.size,
+        np.ascontiguousarray(np.repeat(patches.templates[rows, reference][:, None], C, axis=1)),
+        np.ascontiguousarray(np.repeat(patches.usable[rows, reference][:, None], C, axis=1)),
+        seen,
+        patches.hidden,
+    )
+    others = seen.copy()
+    others[rows, reference] = False
+    ray = patches.positions - view.centers[reference]
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    best = np.full(N, -2.0)
+    start = patches.positions.copy()
+    step = _SWEEP_PX * float(np.median(patches.size)) if N else 1.0
+    for shift in np.arange(-settings.search_front, settings.search_depth + step, step):
+        moved = patches.positions + shift * ray
+        found = align(shared, every, moved, patches.frames, others, view, iterations=(-1, 0), least_correlation=0.0)
+        better = found.correlation > best + 1e-3
+        best = np.where(better, found.correlation, best)
+        start[better] = moved[better]
+    found = align(
+        shared,
+        every,
+        start,
+        patches.frames,
+        seen,
+        view,
+        iterations=(4, 12),
+        least_correlation=settings.camera_correlation,
+        prior_shift_px=5.0,
+        prior_turn=0.2,
+    )
+    agree = others & (found.by_camera >= settings.camera_correlation)
+    mean = np.where(agree, found.by_camera, 0).sum(axis=1) / np.maximum(agree.sum(axis=1), 1)
+    keep = (agree.sum(axis=1) >= settings.n_views - 1) & (mean >= settings.seed_correlation)
+    keep &= found.sigma < settings.sigma_px * patches.size
+    agree[rows, reference] = True
+    patches = patches.moved(found.positions, found.frames).select(keep)
+    own = with_templates(
+        Patches.without_templates(patches.positions, patches.frames, patches.shape, patches.size, C, len(view.levels)),
+        agree[keep],
+        view,
+    )
+    return own.select(np.flatnonzero(own.has.sum(axis=1) >= settings.n_views))
+
+
+def _seen(view: FrameViews, points: np.ndarray) -> np.ndarray:
+    """Cameras in which nothing lies before points of the surface, (N, C) bool."""
+    depth = view.project(points)[1]
+    return depth - view.surface_depth(points) < _HULL_SLACK * view.voxel_size
+
+
+def _outward(view: FrameViews, points: np.ndarray, tree: cKDTree) -> np.ndarray:
+    """Directions from which points are seen, (N, 3) float, unit: mean over their cameras, then over neighbours."""
+    ray = view.centers[None] - points[:, None]
+    ray /= np.linalg.norm(ray, axis=2, keepdims=True)
+    seen = _seen(view, points)
+    return np.einsum("nc,nci->ni", seen.astype(float), ray)
+
+
+def _frame_of(normal: np.ndarray) -> np.ndarray:
+    """Right-handed axes (3, 3) with the normal as third column."""
+    other = np.eye(3)[np.argmin(np.abs(normal))]
+    first = np.cross(other, normal)
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(normal, first), normal], axis=1)

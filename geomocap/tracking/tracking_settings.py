@@ -1,0 +1,28 @@
+"""Settings of surface tracking."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from geomocap.settings import Settings
+
+
+class TrackingSettings(Settings):
+    """How patches of the surface are placed and followed."""
+
+    n_patches: int = Field(2500, ge=10, le=100_000, description="Patches wanted on the surface at any time")
+    radius_px: int = Field(5, ge=2, le=20, description="Half the width of a patch (pixels)")
+    blurs_px: tuple[float, float] = Field((2.5, 0.8), description="Blur of the coarse and the fine level (pixels)")
+    seed_every: int = Field(10, ge=1, description="Frames between two looks for surface without patches")
+    seed_correlation: float = Field(0.8, gt=0, lt=1, description="Least correlation between cameras for a new patch")
+    search_front: float = Field(0.015, ge=0, description="How far before the surface a new patch is looked for (m)")
+    search_depth: float = Field(0.06, ge=0, description="How far behind the surface a new patch is looked for (m)")
+    correlation: float = Field(0.8, gt=0, lt=1, description="Least mean correlation of a tracked patch")
+    camera_correlation: float = Field(0.6, gt=0, lt=1, description="Least correlation for a camera to count")
+    n_views: int = Field(2, ge=1, description="Least number of cameras that see a tracked patch")
+    sigma_px: float = Field(0.35, gt=0, description="Largest standard deviation of a position (pixels on the patch)")
+    slack_px: float = Field(8.0, gt=0, description="Depth by which something must lie before a patch to hide it (px)")
+    neighbour_px: float = Field(3.0, gt=0, description="Largest distance from where neighbours' motion puts it (px)")
+    longest_gap: int = Field(8, ge=0, description="Frames that a lost patch is carried along by its neighbours")
+    backward: bool = Field(True, description="Follow patches placed in later frames backward as well")
+    seed: int = Field(0, ge=0, description="Start of the random numbers")
