@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 
 from geomocap.capture import Capture
+from geomocap.carving.holes import fill_false_holes
+from geomocap.carving.views import Undistortion
 from geomocap.errors import CaptureError
 from geomocap.files import write_atomic
 from geomocap.pipeline.job import Job
@@ -38,23 +40,21 @@ def silhouettes(job: Job) -> str:
 
 
 def _make_silhouettes(job: Job, capture: Capture) -> int:
-    # Camera by camera, so that videos are decoded forwards
     missing = [
-        (camera, k)
-        for camera in capture.cameras
-        for k in range(capture.n_frames)
-        if not job.run.silhouette_file(camera, k).exists()
+        k for k in range(capture.n_frames) if not all(job.run.silhouette_file(c, k).exists() for c in capture.cameras)
     ]
-    cameras = sorted({camera for camera, _ in missing}, key=capture.cameras.index)
-    if capture.has_masks:
-        task = _Cut(capture, job.run, job.config.silhouettes, {}, {})
-    else:
+    models: dict[str, BackgroundModel] = {}
+    if missing and not capture.has_masks:
         learn = _Learn(capture, job.config.silhouettes)
-        models = dict(zip(cameras, map_items(learn, cameras, job.executor, "background", job.progress, 2), strict=True))
-        task = _Cut(capture, job.run, job.config.silhouettes, models, _regions(capture))
-    for _ in map_items(task, missing, job.executor, "silhouettes", job.progress):
+        learnt = map_items(learn, capture.cameras, job.executor, "background", job.progress, 2)
+        models = dict(zip(capture.cameras, learnt, strict=True))
+    undistortion = None
+    if job.config.silhouettes.repair and capture.is_calibrated and not capture.has_masks:
+        undistortion = Undistortion.of(capture.rig)
+    task = _Cut(capture, job.run, job.config.silhouettes, models, _regions(capture), undistortion)
+    for _ in map_items(task, missing, job.executor, "silhouettes", job.progress, 4):
         pass
-    return len(missing)
+    return len(missing) * len(capture.cameras)
 
 
 @dataclass(frozen=True)
@@ -75,23 +75,31 @@ class _Learn:
 
 @dataclass(frozen=True)
 class _Cut:
-    """Silhouette of one image, written to the run."""
+    """Silhouettes of one frame, written to the run."""
 
     capture: Capture
     run: Run
     settings: SilhouetteSettings
     models: dict[str, BackgroundModel]
     regions: dict[str, np.ndarray]
+    undistortion: Undistortion | None
 
-    def __call__(self, item: tuple[str, int]) -> None:
-        camera, frame = item
-        if self.capture.has_masks:
-            mask = self.capture.mask(camera, frame)
-        else:
-            image = self.capture.frame(camera, frame)
-            mask = silhouette(image, self.models[camera], self.settings, self.regions.get(camera))
+    def __call__(self, frame: int) -> None:
+        masks = [self.cut(camera, frame) for camera in self.capture.cameras]
+        if self.undistortion is not None:
+            masks = fill_false_holes(self.capture.rig, self.undistortion.views(masks), masks)
         parameters = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
-        write_atomic(self.run.silhouette_file(camera, frame), lambda p: cv2.imwrite(str(p), mask, parameters))
+        for camera, mask in zip(self.capture.cameras, masks, strict=True):
+            write_atomic(
+                self.run.silhouette_file(camera, frame), lambda p, mask=mask: cv2.imwrite(str(p), mask, parameters)
+            )
+
+    def cut(self, camera: str, frame: int) -> np.ndarray:
+        """Silhouette of one image, (H, W) uint8, 0 or 255."""
+        if self.capture.has_masks:
+            return self.capture.mask(camera, frame)
+        image = self.capture.frame(camera, frame)
+        return silhouette(image, self.models[camera], self.settings, self.regions.get(camera))
 
 
 def _regions(capture: Capture) -> dict[str, np.ndarray]:

@@ -13,6 +13,10 @@ class SilhouetteSettings(Settings):
     samples: int = Field(
         30, ge=2, description="Frames, spread over the recording, from which a camera's background is learnt."
     )
+    repair: bool = Field(
+        default=True,
+        description="Fill enclosed holes behind which the other cameras (4 or more, calibrated) find it thick.",
+    )
     gain: bool = Field(
         default=True, description="Follow slow light changes by a gain and an offset per frame and channel."
     )
