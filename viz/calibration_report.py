@@ -63,7 +63,7 @@ def report_of(calibration: Calibration, plots: dict[str, bytes]) -> Report:
             (
                 plot_block(
                     plots["layout"],
-                    "Where the cameras stand and where the bar was held.",
+                    "Where the cameras stand and where the bar was held",
                     f"{len(n.bars)} bar positions, coloured by frame. World from {c.datum.source}.",
                 ),
             ),
@@ -88,7 +88,7 @@ def report_of(calibration: Calibration, plots: dict[str, bytes]) -> Report:
             (
                 plot_block(
                     plots["residuals"],
-                    "Residuals over each image.",
+                    "Residuals over each image",
                     "Computed minus observed positions of the bar ends, enlarged as the scale bar says. Directions "
                     "that agree in some part of an image show a distortion that the model does not have.",
                 ),
@@ -100,7 +100,7 @@ def report_of(calibration: Calibration, plots: dict[str, bytes]) -> Report:
             (
                 plot_block(
                     plots["coverage"],
-                    "Where in each image the bar was seen.",
+                    "Where in each image the bar was seen",
                     "Number of bar ends in each field. Distortion is extrapolated where there are none.",
                 ),
             ),
@@ -111,7 +111,7 @@ def report_of(calibration: Calibration, plots: dict[str, bytes]) -> Report:
             (
                 plot_block(
                     plots["lengths"],
-                    "Lengths of bars that the cameras were not calibrated with.",
+                    "Lengths of bars that the cameras were not calibrated with",
                     "The calibration was repeated without a part of the bars, and these were then measured by forward "
                     "intersection alone.",
                 ),
@@ -131,7 +131,7 @@ def report_of(calibration: Calibration, plots: dict[str, bytes]) -> Report:
         f"{len(n.names)} cameras, calibrated with a bar of {1000 * n.length:.1f} mm moved through a volume of "
         f"{c.held_out.extent:.2f} m diagonal."
     )
-    return Report("Calibration", lead, tuple((label, value) for label, value in figures), sections)
+    return Report("Calibration", lead, tuple((value, label) for label, value in figures), sections)
 
 
 def camera_table(calibration: Calibration) -> Block:
@@ -142,7 +142,7 @@ def camera_table(calibration: Calibration) -> Block:
 
         def value(key: str, fallback: float, digits: int, p: CameraPrecision = p) -> str:
             v, s = p.parameters.get(key, (fallback, float("nan")))
-            return f"{v:.{digits}f} ± {s:.{digits}f}" if np.isfinite(s) else f"{v:.{digits}f}"
+            return f"{v:.{digits}f}\u00a0±\u00a0{s:.{digits}f}" if np.isfinite(s) else f"{v:.{digits}f}"
 
         rows.append(
             (
@@ -206,7 +206,7 @@ def _colors(count: int) -> tuple[str, ...]:
 
 
 def _grid(count: int, width: float, ratio: float) -> tuple[Figure, list[Axes]]:
-    columns = min(count, 4 if count > 6 else 3)
+    columns = {1: 1, 2: 2, 4: 2}.get(count, 4 if count > 6 else 3)
     rows = -(-count // columns)
     figure = Figure(figsize=(width, rows * (width / columns * ratio + 0.35)), dpi=150, layout="constrained")
     axes = [figure.add_subplot(rows, columns, k + 1) for k in range(count)]
@@ -222,7 +222,9 @@ def _image_axes(ax: Axes, name: str, size: np.ndarray, color: str) -> None:
     ax.grid(False)
     for side in ax.spines.values():
         side.set_visible(True)
-    ax.set_title(name, color=color, fontweight="bold")
+    ax.set_title(name, fontweight="bold")
+    ax.spines["top"].set_color(color)
+    ax.spines["top"].set_linewidth(2.5)
 
 
 @plot
@@ -255,11 +257,11 @@ def layout(calibration: Calibration) -> Figure:
             ray = np.array([centers[k], corner])
             ax.plot(*ray.T, color=color, linewidth=0.8)
             plan.plot(ray[:, 0], ray[:, 1], color=color, linewidth=0.6)
-        ax.text(*centers[k], f" {name}", color=color, fontsize=8)
+        ax.text(*centers[k], f" {name}", color=hex_color(INK), fontsize=8)
         plan.annotate(
             name,
             (centers[k, 0], centers[k, 1]),
-            color=color,
+            color=hex_color(INK),
             textcoords="offset points",
             xytext=(4, 4),
             fontsize=8,

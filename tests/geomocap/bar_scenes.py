@@ -7,7 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
 
+from geomocap.calibration.datum import rigid_alignment
+from geomocap.calibration.network import Network, rotated
+from geomocap.calibration.projection import interior_of
+from geomocap.calibration.sightings import Sightings, stack_candidates
 from geomocap.cameras import Rig
 
 
@@ -158,3 +163,114 @@ def render(scene: Scene, frame: int, camera: int, rng: np.random.Generator, nois
         patch += disc * (215.0 - patch)
     image += rng.normal(0, noise, image.shape)
     return np.repeat(np.clip(np.rint(image), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def true_network(scene: Scene, noise: float, seed: int) -> Network:
+    """The network of a scene with observed points of a given noise, at its true state."""
+    rng = np.random.default_rng(seed)
+    pixels = scene.points(rng, noise)
+    bar, view, end = np.nonzero(np.moveaxis(np.isfinite(pixels[..., 0]), 0, 1))
+    poses = scene.rig.cam_from_world
+    return Network(
+        scene.rig.names,
+        scene.rig.sizes,
+        np.array([interior_of(c) for c in scene.rig.cameras]),
+        np.arange(len(scene.rig)),
+        np.array(poses[:, :, :3]),
+        np.array(poses[:, :, 3]),
+        scene.bars.copy(),
+        np.arange(len(scene.bars)),
+        bar,
+        view,
+        end,
+        pixels[view, bar, end],
+        np.full(len(bar), noise),
+        scene.length,
+        1e-5,
+    )
+
+
+def disturbed_network(scene: Scene, noise: float, seed: int) -> Network:
+    """The same with approximate values: focal lengths 3 % off, no distortion, poses and points shifted."""
+    network = true_network(scene, noise, seed)
+    rng = np.random.default_rng(seed + 100)
+    interior = network.interior.copy()
+    interior[:, :2] *= 1.03
+    interior[:, 2:4] = network.sizes / 2
+    interior[:, 4:] = 0
+    C = len(network.names)
+    return network.with_state(
+        interior,
+        rotated(network.rotation, rng.normal(0, 0.02, (C, 3))),
+        network.translation + rng.normal(0, 0.05, (C, 3)),
+        network.bars + rng.normal(0, 0.03, network.bars.shape),
+    )
+
+
+def seen(
+    scene: Scene, rng: np.random.Generator, noise: float, false: float = 0.0, missing: np.ndarray | None = None
+) -> Sightings:
+    """Sightings of a scene, ends in random order.
+
+    false : share of images with a false blob; missing : share of detections missing in each camera
+    """
+    pixels = scene.points(rng, noise)
+    found = {}
+    for c in range(len(scene.rig)):
+        for t in range(len(scene.bars)):
+            kept = [
+                p for p in pixels[c, t] if np.isfinite(p[0]) and not (missing is not None and rng.random() < missing[c])
+            ]
+            if rng.random() < false:
+                kept.append(rng.uniform([5, 5], scene.rig.sizes[c] - 5))
+            rng.shuffle(kept)
+            found[c, t] = np.array([[*p, noise, 0.0] for p in kept]).reshape(-1, 4)
+    return stack_candidates(scene.rig.names, scene.rig.sizes, np.arange(len(scene.bars)), found)
+
+
+def joined(first: Sightings, second: Sightings, frame: int) -> Sightings:
+    """The first sightings up to a frame, the second from it on."""
+    K = max(first.pixels.shape[2], second.pixels.shape[2])
+
+    def both(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        rest = [(0, 0)] * (a.ndim - 3)
+        wide = [np.pad(x, [(0, 0), (0, 0), (0, K - x.shape[2]), *rest], constant_values=np.nan) for x in (a, b)]
+        return np.concatenate([wide[0][:, :frame], wide[1][:, frame:]], axis=1)
+
+    return Sightings(
+        first.cameras,
+        first.sizes,
+        first.frames,
+        both(first.pixels, second.pixels),
+        both(first.sigmas, second.sigmas),
+        both(first.radii, second.radii),
+    )
+
+
+def knocked(scene: Scene, camera: int, angle_deg: float, shift: float, seed: int = 0) -> Scene:
+    """The scene after one camera was turned and shifted (m)."""
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3)
+    turn = Rotation.from_rotvec(np.radians(angle_deg) * axis / np.linalg.norm(axis)).as_matrix()
+    move = rng.normal(size=3)
+    poses = np.array(scene.rig.cam_from_world)
+    poses[camera] = turn @ poses[camera]
+    poses[camera, :, 3] += shift * move / np.linalg.norm(move)
+    return Scene(Rig(scene.rig.names, scene.rig.cameras, poses), scene.bars, scene.length, scene.radius)
+
+
+def object_errors(scene: Scene, rig: Rig, bars: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, float]:
+    """Errors of bar ends (N, 3) after a rigid alignment without scale, and the reprojection error of the volume, px."""
+    truth = scene.bars[frames]
+    turn = scene.rig.cam_from_world[0, :, :3].T @ rig.cam_from_world[0, :, :3]
+    rough = bars @ turn.T + scene.rig.centers[0] - turn @ rig.centers[0]
+    swap = np.linalg.norm(rough[:, 0] - truth[:, 0], axis=1) > np.linalg.norm(rough[:, 0] - truth[:, 1], axis=1)
+    truth = np.where(swap[:, None, None], truth[:, ::-1], truth).reshape(-1, 3)
+    R, t, _ = rigid_alignment(bars.reshape(-1, 3), truth)
+    errors = bars.reshape(-1, 3) @ R.T + t - truth
+    ends = scene.bars.reshape(-1, 3)
+    axes = [np.linspace(a, b, 7) for a, b in zip(ends.min(axis=0), ends.max(axis=0), strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    true, ours = scene.rig.project(grid), rig.project((grid - t) @ R)
+    inside = (true > 0).all(axis=2) & (true < scene.rig.sizes[:, None]).all(axis=2)
+    return errors, float(np.sqrt(np.mean((ours - true)[inside] ** 2)))
