@@ -141,9 +141,7 @@ def _normal_equations(
 
 def _solve(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Solve many 3×3 systems by their adjugates: solutions, 0 where A is singular, and which were regular."""
-    c = np.stack(
-        [np.cross(A[:, 1], A[:, 2]), np.cross(A[:, 2], A[:, 0]), np.cross(A[:, 0], A[:, 1])], axis=2
-    )
+    c = np.stack([np.cross(A[:, 1], A[:, 2]), np.cross(A[:, 2], A[:, 0]), np.cross(A[:, 0], A[:, 1])], axis=2)
     det = np.einsum("ni,ni->n", A[:, 0], c[:, :, 0])
     size = np.trace(A, axis1=1, axis2=2) / 3
     regular = det > 1e-12 * size**3

@@ -19,6 +19,7 @@ from geomocap.cloud.settings import CloudSettings
 from geomocap.errors import GeometryError
 from geomocap.geometry import Voxels
 from geomocap.matching.growing import SurfaceMatches, grow
+from geomocap.matching.plane_sweep import SweepImages
 from geomocap.matching.seeds import find_seeds
 from geomocap.matching.spline import ImageStack
 from geomocap.matching.wallis import wallis
@@ -182,8 +183,12 @@ def cloud_of_frame(
         Layer(t.points, t.cells, t.surface.grid, t.surface.planes, t.group.template, settings.growing.step)
         for t in templates
     ]
-    kept = merge(layers, groups.rig, settings.merge) if len(layers) > 1 else [np.ones(len(t.points), bool) for t in templates]
-    for t, k in zip(templates, kept, strict=True):
+    kept = (
+        merge(layers, groups.rig, settings.merge)
+        if len(layers) > 1
+        else [np.ones(len(t.points), bool) for t in templates]
+    )
+    for _t, k in zip(templates, kept, strict=True):
         if (~k).any():
             reasons["measured better from another template"] += int((~k).sum())
     points = MeasuredPoints.join([t.points.select(k) for t, k in zip(templates, kept, strict=True)])
@@ -201,9 +206,11 @@ def measure_template(
         # The hull hides nothing of the subject: where it is not, nothing is to be found
         mask = np.isfinite(depth.near) if mask is None else mask & np.isfinite(depth.near)
     focal = rig.cameras[t].mean_focal_length()
-    seeds = find_seeds(
-        prepared.filtered, [*prepared.inner], t, searches, group.transfers, depth, focal, settings.seeds
+    used = [t, *searches.tolist()]
+    smooth = SweepImages.of(
+        [prepared.filtered[i] for i in used], [prepared.inner[i] for i in used], settings.seeds.blur
     )
+    seeds = find_seeds(prepared.filtered[t], mask, smooth, group.transfers, depth, focal, settings.seeds)
     surface = grow(
         prepared.stack,
         t,
@@ -214,6 +221,8 @@ def measure_template(
         settings.growing,
         settings.kernel,
         min(settings.least_views - 1, len(searches)),
+        smooth,
+        focal,
     )
     points, cells = intersect(prepared, rig, surface, settings)
     reasons = Counter(surface.reasons)

@@ -116,9 +116,7 @@ def _searches(rig: Rig, template: int, angles: np.ndarray, settings: GroupSettin
     """Choose search cameras of one template, best first."""
     angle = angles[template]
     possible = [
-        i
-        for i in range(len(rig))
-        if i != template and settings.least_angle <= angle[i] <= settings.greatest_angle
+        i for i in range(len(rig)) if i != template and settings.least_angle <= angle[i] <= settings.greatest_angle
     ]
     # Directions in which the other cameras lie, seen from the template
     side = (rig.centers - rig.centers[template]) @ rig.cam_from_world[template, :2, :3].T
@@ -127,7 +125,9 @@ def _searches(rig: Rig, template: int, angles: np.ndarray, settings: GroupSettin
     while possible and len(chosen) < settings.searches:
         # On another side than those chosen, and near the angle aimed at
         crowded = [max((float(side[i] @ side[j]) for j in chosen), default=-1.0) for i in possible]
-        cost = [abs(np.log(angle[i] / settings.best_angle)) + max(c, 0.0) for i, c in zip(possible, crowded, strict=True)]
+        cost = [
+            abs(np.log(angle[i] / settings.best_angle)) + max(c, 0.0) for i, c in zip(possible, crowded, strict=True)
+        ]
         best = possible[int(np.argmin(cost))]
         chosen.append(best)
         possible.remove(best)

@@ -1,9 +1,10 @@
 """Clouds of several templates become one without double layers.
 
-Each template's measurement is a depth map. A point is compared with every other template's map where it projects into it:
-the same surface, in front of it (the other camera sees through the point), or hidden behind it. Of a surface that several
-templates measured, the one that looks at it most directly with most images is kept; a point through which more templates
-see than agree with it is dropped (visibility as in Merrell et al. 2007, "Real-time visibility-based fusion of depth maps").
+Each template's measurement is a depth map. A point is compared with every other template's map where it projects into
+it: the same surface, in front of it (the other camera sees through the point), or hidden behind it. Of a surface that
+several templates measured, the one that looks at it most directly with most images is kept; a point through which
+more templates see than agree with it is dropped (visibility as in Merrell et al. 2007, "Real-time visibility-based
+fusion of depth maps").
 """
 
 from __future__ import annotations
@@ -116,7 +117,7 @@ def _cell_at(layer: Layer, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     number = layer.grid.image(np.arange(len(layer.grid)), -1)
     with np.errstate(invalid="ignore"):
         place = np.rint((pixels - 0.5) / layer.step - 0.5)
-    inside = np.isfinite(place).all(axis=1)
+    inside: np.ndarray = np.isfinite(place).all(axis=1)
     inside[inside] &= ((place[inside] >= 0) & (place[inside] < np.array(number.shape)[::-1])).all(axis=1)
     cell = np.full(len(pixels), -1, np.int64)
     column, row = place[inside].astype(int).T

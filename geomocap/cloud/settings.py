@@ -17,7 +17,9 @@ class GroupSettings(Settings):
     templates: Literal["auto", "one", "all"] = Field(
         "auto", description="one: the most central camera; all: every camera; auto: one up to three cameras"
     )
-    template_camera: str | None = Field(None, description="the template if there is only one; the most central if not given")
+    template_camera: str | None = Field(
+        None, description="the template if there is only one; the most central if not given"
+    )
     searches: int = Field(2, ge=1, le=6, description="most search images of a template")
     least_angle: float = Field(6.0, ge=0, lt=90, description="least angle between viewing directions (degrees)")
     best_angle: float = Field(25.0, gt=0, lt=90, description="angle between viewing directions aimed at (degrees)")

@@ -1,20 +1,21 @@
 """The growing front: which cells are matched next, and from which neighbour they start.
 
-Cells are matched in rounds. All cells of a round start from cells of earlier rounds and see nothing of each other, so that
-the result does not depend on the number of threads.
+Cells are matched in rounds. All cells of a round start from cells of earlier rounds and see nothing of each other, so
+that the result does not depend on the number of threads.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from geomocap.matching import grow_kernel as gk
 from geomocap.matching import patch_kernel as pk
 from geomocap.matching.grid import Grid
+from geomocap.matching.plane_sweep import SweepImages, tilt_planes
 from geomocap.matching.seeds import Seeds
-from geomocap.matching.settings import GrowingSettings, KernelSettings
+from geomocap.matching.settings import GrowingSettings, KernelSettings, SeedSettings
 from geomocap.matching.spline import ImageStack
 
 _LEFT, _RIGHT, _ABOVE, _BELOW = range(4)
@@ -24,7 +25,7 @@ _GAP = 3
 def limits_of(settings: GrowingSettings, kernel: KernelSettings, least_images: int = 1) -> np.ndarray:
     """Pack thresholds as the kernel wants them."""
     limits = np.zeros(gk.LIMITS)
-    limits[gk.ITERATIONS] = kernel.iterations
+    limits[gk.ITERATIONS] = min(settings.iterations, kernel.iterations)
     limits[gk.TOLERANCE] = kernel.tolerance
     limits[gk.CONTRAST] = kernel.minimum_contrast
     limits[gk.MAX_SHIFT] = settings.maximum_shift
@@ -50,6 +51,10 @@ class Front:
         Planes of matched cells.
     tries : (N,) int
         Rounds in which a cell was tried in vain.
+    smooth : SweepImages, optional
+        For trying tilted planes.
+    focal : float
+        Camera constant of the template, pixels.
     """
 
     grid: Grid
@@ -64,6 +69,9 @@ class Front:
     quality: np.ndarray
     planes: np.ndarray
     tries: np.ndarray
+    smooth: SweepImages | None = None
+    focal: float = 0.0
+    seeds: SeedSettings = field(default_factory=SeedSettings)
 
     @classmethod
     def over(
@@ -76,6 +84,8 @@ class Front:
         settings: GrowingSettings,
         kernel: KernelSettings,
         least_images: int = 1,
+        smooth: SweepImages | None = None,
+        focal: float = 0.0,
     ) -> Front:
         """Begin with no cell matched."""
         n, k = len(grid), len(searches)
@@ -84,7 +94,7 @@ class Front:
         limits = limits_of(settings, kernel, least_images)
         transfers = np.ascontiguousarray(transfers, dtype=np.float64)
         state = np.zeros((n, k, 2)), np.zeros((n, k, 4)), quality, np.zeros((n, gk.PLANE)), np.zeros(n, np.int64)
-        return cls(grid, images, template, searches, transfers, limits, settings, *state)
+        return cls(grid, images, template, searches, transfers, limits, settings, *state, smooth, focal)
 
     @property
     def matched(self) -> np.ndarray:
@@ -114,11 +124,18 @@ class Front:
         points = self.grid.pixels[targets] - 0.5
         radius = self.settings.radius
         left = self._match(targets, moved(planes, points - origins), points, radius, first=True)
-        # A larger patch
-        larger = round(radius * self.settings.larger)
-        if larger > radius and len(left):
-            rest = self._match(targets[left], moved(planes[left], (points - origins)[left]), points[left], larger)
-            left = left[rest]
+        # A larger patch where texture is short, a smaller one where the surface is not plane enough
+        reason = self.quality[targets, :, pk.STATUS]
+        short = ((reason == pk.LOW_TEXTURE) | (reason == pk.PRECISION)).any(axis=1)
+        for other, which in (
+            (round(radius * self.settings.larger), short),
+            (max(round(radius / self.settings.larger), 3), ~short),
+        ):
+            chosen = left[which[left]]
+            if other != radius and len(chosen):
+                rest = self._match(targets[chosen], moved(planes, points - origins)[chosen], points[chosen], other)
+                done = np.setdiff1d(chosen, chosen[rest], assume_unique=True)
+                left = np.setdiff1d(left, done, assume_unique=True)
         # A smaller shift: a point half way hands its own plane on
         left = left[np.abs(points - origins)[left].max(axis=1, initial=0) > 0.5]
         if len(left):
@@ -247,7 +264,38 @@ class Front:
                 choice = np.argsort(-key, axis=1, kind="stable")[:, direction]
                 there = np.take_along_axis(key, choice[:, None], axis=1)[:, 0] > -np.inf
                 self.step(at[left, choice][there], left[there])
+            if self.settings.tilting and self.smooth is not None:
+                left = np.flatnonzero(~self.matched[targets])
+                self._tilted(targets[left], around[targets[left]])
             fresh = self.matched & ~matched
+
+    def _tilted(self, targets: np.ndarray, around: np.ndarray) -> None:
+        """Turn the plane of the best neighbour to where the images correlate best, as beyond an edge of the surface."""
+        if self.smooth is None or len(targets) == 0:
+            return
+        at = self.grid.neighbours[targets]
+        best = np.where(around, self.planes[at, gk.KEY], -np.inf).argmax(axis=1)
+        source = at[np.arange(len(at)), best]
+        points = self.grid.pixels[targets] - 0.5
+        planes = moved(self.planes[source], self.grid.pixels[targets] - self.grid.pixels[source])
+        smooth, correlation = self.smooth, np.zeros(len(targets))
+        tilt_planes(
+            smooth.flat,
+            smooth.seen,
+            smooth.shapes,
+            smooth.starts,
+            self.transfers,
+            points,
+            planes,
+            self.focal,
+            self.settings.radius,
+            1.0,
+            self.seeds.tilt,
+            self.seeds.tilts,
+            correlation,
+        )
+        good = correlation >= self.seeds.correlation
+        self._attempt(targets[good], planes[good], points[good])
 
     def _from_mean(self, targets: np.ndarray, around: np.ndarray) -> None:
         at = self.grid.neighbours[targets]

@@ -1,8 +1,8 @@
 """Matching many points of one template image, each from the plane expected there; compiled.
 
 What a point hands to its neighbours is a plane: inverse depth μ and its slope in the template image. The start of the
-neighbour in every search image, position and affine matrix, follows from it (`epipolar.plane_affine`), also in images in
-which the point itself was not seen.
+neighbour in every search image, position and affine matrix, follows from it (`epipolar.plane_affine`), also in images
+in which the point itself was not seen.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def _gate(masks, layout, searches, limits, floor, wanted, position, quality):
             continue
         q = quality[k]
         if q[pk.STATUS] == pk.MATCHED:
-            start, stride, height, width = layout[searches[k]]
+            start, stride, _height, _width = layout[searches[k]]
             at = start + int(position[k, 1] + 0.5) * stride + int(position[k, 0] + 0.5)
             limit = limits[MAX_DEVIATION] * limits[MAX_DEVIATION]
             if masks[at] == 0:

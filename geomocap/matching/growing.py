@@ -13,9 +13,11 @@ from geomocap.matching import patch_kernel as pk
 from geomocap.matching.front import Front
 from geomocap.matching.grid import Grid
 from geomocap.matching.lsm import Matches, count_reasons, matches_of
+from geomocap.matching.plane_sweep import SweepImages
 from geomocap.matching.seeds import Seeds
 from geomocap.matching.settings import GrowingSettings, KernelSettings
 from geomocap.matching.spline import ImageStack
+
 
 @dataclass(frozen=True)
 class SurfaceMatches:
@@ -69,6 +71,8 @@ def grow(
     settings: GrowingSettings | None = None,
     kernel: KernelSettings | None = None,
     least_images: int = 1,
+    smooth: SweepImages | None = None,
+    focal: float = 0.0,
 ) -> SurfaceMatches:
     """Match the template densely, beginning at the seeds.
 
@@ -87,6 +91,10 @@ def grow(
         Its radius and greatest shift are not used, `settings` has its own.
     least_images : int
         Search images that have to see a point.
+    smooth : SweepImages, optional
+        Smoothed images of the group, for trying tilted planes at holes.
+    focal : float
+        Camera constant of the template, pixels; for the same.
 
     Returns
     -------
@@ -97,7 +105,7 @@ def grow(
     searches = np.asarray(searches, dtype=np.int64)
     height, width = (int(v) for v in images.layout[template, 2:])
     grid = Grid.over((height, width), settings.step, mask)
-    front = Front.over(grid, images, template, searches, transfers, settings, kernel, least_images)
+    front = Front.over(grid, images, template, searches, transfers, settings, kernel, least_images, smooth, focal)
 
     # Voronoi regions of the seeds; each begins at the cell nearest to its seed
     region, begin = regions(grid, seeds)

@@ -206,7 +206,8 @@ def match_patch(
             quality[k, GAIN] = gain
             state[k, MEAN] += off
             state[k, VARIANCE] = ff * max(1.0 - correlation * correlation, 1e-8) / (count - 8)
-            if not gain > 0:
+            # What correlates with nothing after some steps will not come right
+            if not gain > 0 or (quality[k, ITERATIONS] >= 4 and correlation < 0.3):
                 quality[k, STATUS] = CORRELATION
                 use[k] = 0.0
                 continue

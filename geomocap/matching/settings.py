@@ -36,8 +36,10 @@ class SeedSettings(Settings):
     radius: int = Field(8, ge=3, le=40, description="radius of the patches that are correlated (px)")
     blur: float = Field(1.2, ge=0, description="smoothing before the search, standard deviation (px)")
     step: float = Field(1.5, gt=0.1, description="step along the epipolar line (px)")
-    tilt: float = Field(0.8, ge=0, description="tangent of the tilts of the planes that are tried, both ways; 0: none")
-    correlation: float = Field(0.6, ge=-1, le=1, description="least correlation in every image")
+    tilt: float = Field(0.7, gt=0, description="step of the tangents of the tilts of the planes that are tried")
+    tilts: int = Field(2, ge=0, le=4, description="number of such steps each way, in x and in y")
+    correlation: float = Field(0.5, ge=-1, le=1, description="least correlation in every image")
+    pair_correlation: float = Field(0.8, ge=-1, le=1, description="the same where one search image alone agrees")
     uniqueness: float = Field(0.08, ge=0, description="least lead in correlation over any other place on the line")
     agreement: float = Field(3.0, gt=0, description="farthest that the images' own best places may lie apart (px)")
 
@@ -45,20 +47,22 @@ class SeedSettings(Settings):
 class GrowingSettings(Settings):
     """How matching spreads from the seeds over the template image."""
 
-    step: float = Field(2.0, gt=0.25, description="distance of neighbouring points in the template image (px)")
+    step: float = Field(1.5, gt=0.25, description="distance of neighbouring points in the template image (px)")
     order: Literal["best", "paper"] = Field(
         "best", description="best: best neighbour first; paper: sequential horizontal and vertical shifts"
     )
-    radius: int = Field(6, ge=2, le=40, description="patch radius (px)")
+    radius: int = Field(5, ge=2, le=40, description="patch radius: 5 makes 11×11 patches (px)")
     larger: float = Field(1.5, ge=1, description="growth of the patch where the quality is poor; 1: none")
     minimum_correlation: float = Field(0.8, ge=-1, le=1, description="least correlation after matching")
     pair_correlation: float = Field(0.9, ge=-1, le=1, description="the same if one search image alone saw the point")
     maximum_sigma0: float = Field(30.0, gt=0, description="greatest a-posteriori sigma (grey levels after filtering)")
     maximum_deviation: float = Field(0.2, gt=0, description="greatest standard deviation in x and in y (px)")
+    iterations: int = Field(10, ge=1, description="limit of iterations, fewer than for single points")
     maximum_shift: float = Field(1.5, gt=0, description="farthest way from the start (px)")
     seed_shift: float = Field(4.0, gt=0, description="the same for seeds, whose start is coarser (px)")
     maximum_epipolar: float = Field(0.7, gt=0, description="greatest distance from the epipolar line (px)")
     attempts: int = Field(3, ge=1, le=8, description="neighbours from which a point is tried")
-    hole_passes: int = Field(8, ge=0, description="rounds of filling holes from all directions")
+    hole_passes: int = Field(40, ge=0, description="most rounds of filling holes from all directions")
+    tilting: bool = Field(True, description="whether holes are also tried on planes tilted otherwise, as at an edge")
     agreement: float = Field(0.6, gt=0, description="greatest departure from what a neighbour predicts (px)")
     minimum_patch: int = Field(40, ge=1, description="least number of points that hang together")

@@ -1,7 +1,7 @@
 """Wallis filter: local mean and contrast brought to target values.
 
-Wallis 1976, "An approach to the space variant restoration and enhancement of images": with the mean m and standard deviation s of a
-window around each pixel,
+Wallis 1976, "An approach to the space variant restoration and enhancement of images": with the mean m and standard
+deviation s of a window around each pixel,
 
     g' = r₁ g + r₀,   r₁ = c s_t / (c s + (1 − c) s_t),   r₀ = b m_t + (1 − b − r₁) m.
 """

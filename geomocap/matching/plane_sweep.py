@@ -1,0 +1,437 @@
+"""Correlation of template patches laid on planes in object space, compiled.
+
+Images stand one behind the other in `flat`, the template first, row by row without padding; `seen` is 1 where they show
+the subject. Positions are array indices; correlation uses every second pixel and bilinear values of smoothed images.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit, prange
+
+from geomocap.matching.grow_kernel import plane_start
+from geomocap.matching.patch_kernel import transfer
+from geomocap.matching.spline import FAST
+
+
+@dataclass(frozen=True)
+class SweepImages:
+    """Smoothed images of a template group.
+
+    Attributes
+    ----------
+    flat : (M,) float32
+    seen : (M,) uint8
+    shapes : (K + 1, 2) int64
+    starts : (K + 1,) int64
+    """
+
+    flat: np.ndarray
+    seen: np.ndarray
+    shapes: np.ndarray
+    starts: np.ndarray
+
+    @classmethod
+    def of(cls, images: list[np.ndarray], masks: list[np.ndarray | None], blur: float) -> SweepImages:
+        """Smooth grey images (H, W), the template first, by a Gaussian of standard deviation `blur`, pixels."""
+        smooth = [np.asarray(image, dtype=np.float32) for image in images]
+        if blur > 0:
+            smooth = [np.asarray(cv2.GaussianBlur(s, (0, 0), blur), dtype=np.float32) for s in smooth]
+        seen = [
+            np.ones(s.size, np.uint8) if m is None else (np.asarray(m) != 0).astype(np.uint8).ravel()
+            for s, m in zip(smooth, masks, strict=True)
+        ]
+        shapes = np.array([s.shape for s in smooth], dtype=np.int64)
+        starts = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))[:-1]])
+        return cls(np.concatenate([s.ravel() for s in smooth]), np.concatenate(seen), shapes, starts)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _correlate(flat, start, height, width, f, offsets, variance, position, affine, radius):
+    """Normalised correlation of the centred template samples `f` at `offsets` with an image under a warp, bilinear."""
+    ex = (abs(affine[0]) + abs(affine[1])) * radius
+    ey = (abs(affine[2]) + abs(affine[3])) * radius
+    px, py = position
+    if not (px - ex >= 0 and py - ey >= 0 and px + ex < width - 1 and py + ey < height - 1):
+        return -2.0
+    s = ss = sf = 0.0
+    n = len(f)
+    for i in range(n):
+        dx, dy = offsets[i]
+        x = px + affine[0] * dx + affine[1] * dy
+        y = py + affine[2] * dx + affine[3] * dy
+        ix = int(x)
+        iy = int(y)
+        tx = x - ix
+        ty = y - iy
+        at = start + iy * width + ix
+        top = flat[at] + tx * (flat[at + 1] - flat[at])
+        bottom = flat[at + width] + tx * (flat[at + width + 1] - flat[at + width])
+        g = top + ty * (bottom - top)
+        s += g
+        ss += g * g
+        sf += g * f[i]
+    spread = ss - s * s / n
+    if not spread > 1e-6 * ss:
+        return -2.0
+    return sf / math.sqrt(spread * variance)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def on_plane(
+    transfers, shapes, starts, flat, x, y, plane, f, offsets, variance, radius, position, affine, point, each, only
+):
+    """Mean correlation with the template patch laid on a plane, of all images or `only` one; each into `each`."""
+    each[:] = -2.0
+    if not plane_start(transfers, x, y, plane, position, affine, point):
+        return -2.0
+    total = 0.0
+    count = 0
+    for k in range(len(transfers)):
+        if only >= 0 and k != only:
+            continue
+        h, w = shapes[k + 1]
+        each[k] = _correlate(flat, starts[k + 1], h, w, f, offsets, variance, position[k], affine[k], radius)
+        total += each[k]
+        count += 1
+    return total / count
+
+
+@njit(cache=True, nogil=True)
+def _template_patch(flat, seen, height, width, ix, iy, radius):
+    """Centred samples of every second template pixel of the subject, their offsets, and the sum of their squares."""
+    side = radius + 1
+    f = np.empty(side * side)
+    offsets = np.empty((side * side, 2))
+    n = 0
+    mean = 0.0
+    if ix >= radius and iy >= radius and ix + radius < width and iy + radius < height:
+        for dy in range(-radius, radius + 1, 2):
+            for dx in range(-radius, radius + 1, 2):
+                at = (iy + dy) * width + ix + dx
+                if seen[at]:
+                    f[n] = flat[at]
+                    offsets[n] = dx, dy
+                    mean += f[n]
+                    n += 1
+    variance = 0.0
+    if n >= 0.3 * side * side:
+        for i in range(n):
+            f[i] -= mean / n
+            variance += f[i] * f[i]
+    return f[:n], offsets[:n], variance
+
+
+@njit(cache=True, nogil=True)
+def _refine(
+    transfers,
+    shapes,
+    starts,
+    flat,
+    x,
+    y,
+    plane,
+    depth_step,
+    slope_step,
+    top,
+    f,
+    offsets,
+    variance,
+    radius,
+    position,
+    affine,
+    point,
+    trial,
+    each,
+    only,
+):
+    """Improve a plane, one unknown after the other with halved steps; returns its mean correlation."""
+    for _ in range(4):
+        depth_step *= 0.5
+        slope_step *= 0.5
+        for unknown in range(3):
+            for sign in (-1.0, 1.0):
+                trial[:] = plane
+                trial[unknown] += sign * (depth_step if unknown == 0 else slope_step)
+                total = on_plane(
+                    transfers,
+                    shapes,
+                    starts,
+                    flat,
+                    x,
+                    y,
+                    trial,
+                    f,
+                    offsets,
+                    variance,
+                    radius,
+                    position,
+                    affine,
+                    point,
+                    each,
+                    only,
+                )
+                if total > top:
+                    top = total
+                    plane[:] = trial
+    return top
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def tilt_planes(
+    flat, seen, shapes, starts, transfers, points, planes, focal, radius, depth_pixels, tilt, tilts, correlation
+):
+    """Turn planes (N, PLANE) about their points (N, 2) to where the images correlate best; write the correlations (N,)."""
+    images = len(transfers)
+    side = 2 * tilts + 1
+    for s in prange(len(points)):
+        x, y = points[s]
+        height, width = shapes[0]
+        correlation[s] = -2.0
+        f, offsets, variance = _template_patch(flat, seen, height, width, int(x), int(y), radius)
+        if not variance > 0:
+            continue
+        position = np.empty((images, 2))
+        affine = np.empty((images, 4))
+        point = np.empty(6)
+        each = np.empty(images)
+        plane = planes[s].copy()
+        trial = planes[s].copy()
+        best = planes[s].copy()
+        speed = 0.0
+        for k in range(images):
+            if transfer(transfers[k], plane[0], x, y, point):
+                speed = max(speed, math.hypot(point[2], point[3]))
+        if speed == 0.0:
+            continue
+        slope = plane[0] * tilt / focal
+        top = -2.0
+        for t in range(side * side + 1):
+            trial[:] = plane
+            if t < side * side:
+                trial[1] = slope * (t % side - tilts)
+                trial[2] = slope * (t // side - tilts)
+            total = on_plane(
+                transfers,
+                shapes,
+                starts,
+                flat,
+                x,
+                y,
+                trial,
+                f,
+                offsets,
+                variance,
+                radius,
+                position,
+                affine,
+                point,
+                each,
+                -1,
+            )
+            if total > top:
+                top = total
+                best[:] = trial
+        correlation[s] = _refine(
+            transfers,
+            shapes,
+            starts,
+            flat,
+            x,
+            y,
+            best,
+            2 * depth_pixels / speed,
+            slope,
+            top,
+            f,
+            offsets,
+            variance,
+            radius,
+            position,
+            affine,
+            point,
+            trial,
+            each,
+            -1,
+        )
+        planes[s] = best
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def sweep(
+    flat,
+    seen,
+    shapes,
+    starts,
+    transfers,
+    points,
+    bounds,
+    focal,
+    radius,
+    step,
+    tilt,
+    tilts,
+    least,
+    pair_least,
+    lead,
+    agreement,
+    result,
+):
+    """Find the best plane of every point (N, 2) on its ray, between inverse depths `bounds` (N, 2).
+
+    `result` (N, 5) receives the number of a reason in `seeds.REASONS`, the plane, and its correlation.
+    """
+    images = len(transfers)
+    side = 2 * tilts + 1
+    for s in prange(len(points)):
+        x, y = points[s]
+        ix, iy = int(x), int(y)
+        low, high = bounds[s]
+        result[s, 0] = 1
+        if not (low > 0 and high > low):
+            continue
+        height, width = shapes[0]
+        f, offsets, variance = _template_patch(flat, seen, height, width, ix, iy, radius)
+        if not variance > 0:
+            continue
+        position = np.empty((images, 2))
+        affine = np.empty((images, 4))
+        point = np.empty(6)
+        plane = np.zeros(5)
+        trial = np.zeros(5)
+        each = np.empty(images)
+        # Steps of μ that move the fastest image by `step`
+        length = 0.0
+        for k in range(images):
+            if transfer(transfers[k], high, x, y, point):
+                ax, ay = point[0], point[1]
+                if transfer(transfers[k], low, x, y, point):
+                    length = max(length, math.hypot(ax - point[0], ay - point[1]))
+        steps = min(max(int(length / step) + 1, 2), 2000)
+        scores = np.full((steps, images + 1), -2.0)
+        tilt_of = np.zeros((steps, images + 1), np.int64)
+        for m in range(steps):
+            mu = low + (high - low) * (m + 0.5) / steps
+            inside = True
+            for k in range(images):
+                if not transfer(transfers[k], mu, x, y, point):
+                    inside = False
+                    break
+                h, w = shapes[k + 1]
+                if not (point[0] >= 0 and point[1] >= 0 and point[0] < w - 1 and point[1] < h - 1):
+                    continue
+                # Off the subject in one image: there is no surface
+                if seen[starts[k + 1] + int(point[1] + 0.5) * w + int(point[0] + 0.5)] == 0:
+                    inside = False
+                    break
+            if not inside:
+                continue
+            for t in range(side * side):
+                plane[0] = mu
+                plane[1] = mu * tilt / focal * (t % side - tilts)
+                plane[2] = mu * tilt / focal * (t // side - tilts)
+                total = on_plane(
+                    transfers,
+                    shapes,
+                    starts,
+                    flat,
+                    x,
+                    y,
+                    plane,
+                    f,
+                    offsets,
+                    variance,
+                    radius,
+                    position,
+                    affine,
+                    point,
+                    each,
+                    -1,
+                )
+                for k in range(images):
+                    if each[k] > scores[m, k]:
+                        scores[m, k] = each[k]
+                        tilt_of[m, k] = t
+                if total > scores[m, images]:
+                    scores[m, images] = total
+                    tilt_of[m, images] = t
+        # All images together; where they don't agree, one of them alone, which then has to be the better
+        unit = (high - low) / steps
+        pixels = length / steps
+        apart = math.ceil(4.0 / pixels)
+        for choice in range(images + 1):
+            only = choice - 1
+            column = images if only < 0 else only
+            if only >= 0 and images == 1:
+                break
+            best = np.argmax(scores[:, column])
+            t = tilt_of[best, column]
+            plane[0] = low + unit * (best + 0.5)
+            plane[1] = plane[0] * tilt / focal * (t % side - tilts)
+            plane[2] = plane[0] * tilt / focal * (t // side - tilts)
+            top = scores[best, column]
+            needed = least if only < 0 else pair_least
+            if top > needed - lead:
+                top = _refine(
+                    transfers,
+                    shapes,
+                    starts,
+                    flat,
+                    x,
+                    y,
+                    plane,
+                    unit,
+                    plane[0] * tilt / focal,
+                    top,
+                    f,
+                    offsets,
+                    variance,
+                    radius,
+                    position,
+                    affine,
+                    point,
+                    trial,
+                    each,
+                    only,
+                )
+            on_plane(
+                transfers,
+                shapes,
+                starts,
+                flat,
+                x,
+                y,
+                plane,
+                f,
+                offsets,
+                variance,
+                radius,
+                position,
+                affine,
+                point,
+                each,
+                only,
+            )
+            status = 0
+            for m in range(steps):
+                if abs(m - best) > apart and scores[m, column] > top - lead * (1 if only < 0 else 2):
+                    status = 3
+            if only < 0:
+                for k in range(images):
+                    own = np.argmax(scores[:, k])
+                    if abs(own - best) * pixels > agreement and scores[own, k] > each[k] + 0.5 * lead:
+                        status = 4
+                if each.min() < least:
+                    status = 2
+            elif top < pair_least:
+                status = 2
+            if only < 0 or status == 0:
+                result[s, 0] = status
+                result[s, 1:4] = plane[:3]
+                result[s, 4] = top
+            if status == 0:
+                break
