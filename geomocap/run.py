@@ -13,7 +13,7 @@ import shutil
 import threading
 import time
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -99,7 +99,7 @@ class Run:
         """
         file = self.path / name
         try:
-            with np.load(file, allow_pickle=False) as data:
+            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
                 return dict(data)
         except FileNotFoundError:
             raise RunError(f"{file}: missing; run the stage that writes it") from None
@@ -108,7 +108,7 @@ class Run:
 
     # --- stages ---
 
-    def begin(self, stage: str, key: str, outputs: list[str]) -> None:
+    def begin(self, stage: str, key: str, outputs: Sequence[str], optional: Sequence[str] = ()) -> None:
         """Open a stage for writing: if its key has changed, delete what it wrote before.
 
         Parameters
@@ -116,13 +116,15 @@ class Run:
         stage : str
         key : str
             From `stage_key`.
-        outputs : list of str
-            Files and folders of the run that the stage writes.
+        outputs : sequence of str
+            Files and folders of the run that the stage always writes.
+        optional : sequence of str
+            Those that it may write.
         """
         if self._state(stage).get("key") == key:
             return
         try:
-            for name in outputs:
+            for name in (*outputs, *optional):
                 target = self.path / name
                 if target.is_dir():
                     shutil.rmtree(target)
@@ -130,7 +132,7 @@ class Run:
                     target.unlink(missing_ok=True)
         except OSError as error:
             raise RunError(f"{self.path}: old results of {stage} can't be deleted ({error.strerror})") from None
-        self._write_state(stage, {"key": key, "done": False, "outputs": outputs})
+        self._write_state(stage, {"key": key, "done": False, "outputs": list(outputs)})
 
     def finish(self, stage: str) -> None:
         """Mark a stage as complete."""

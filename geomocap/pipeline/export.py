@@ -1,8 +1,9 @@
-"""Stage: skeleton → motion files that need no package beyond the core."""
+"""Stage: skeleton → motion files, all whose packages are installed."""
 
 from __future__ import annotations
 
 from geomocap.export.run_export import FILES, export_run
+from geomocap.files import fingerprint
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.segmentation import Source, segment
 from geomocap.run import stage_key
@@ -13,10 +14,12 @@ def motion_files(job: Job, source: Source) -> str:
     segmented = segment(job, source)
     if not (job.run.path / "skeleton.npz").exists():
         return segmented
-    key = stage_key("export", segmented, job.config.export.model_dump(), job.up)
+    names = fingerprint([job.run.path / "names.toml"])
+    key = stage_key("export", segmented, job.config.export.model_dump(), job.up, names)
 
     def work() -> int:
         written = export_run(job.run, settings=job.config.export, progress=job.progress)
         return len(written.files)
 
-    return job.stage("export", key, [FILES["bvh"], FILES["trc"], FILES["glb"]], work)
+    always = [FILES["bvh"], FILES["trc"], FILES["glb"]]
+    return job.stage("export", key, always, work, [f for f in FILES.values() if f not in always])

@@ -42,16 +42,23 @@ class Job:
     scans: Scans | None = None
     fps: float = 30.0
 
-    def stage(self, name: str, key: str, outputs: Sequence[str], work: Callable[[], int]) -> str:
+    def stage(
+        self, name: str, key: str, outputs: Sequence[str], work: Callable[[], int], optional: Sequence[str] = ()
+    ) -> str:
         """Do a stage's work, unless it has been done with the same key; return the key.
 
         Parameters
         ----------
+        name, key : str
+        outputs : sequence of str
+            Files and folders that the stage always writes.
         work : callable
             Does the work and returns the number of items worked on.
+        optional : sequence of str
+            Files that it may write; old ones are deleted as well when the key has changed.
         """
         if not self.run.is_done(name, key):
-            self.run.begin(name, key, list(outputs))
+            self.run.begin(name, key, outputs, optional)
             with self.run.timed(name) as count:
                 count["items"] = work()
             self.run.finish(name)
