@@ -1,0 +1,189 @@
+"""The coarse motion of a surface: which limb went where, decided among several starts for each frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from geomocap.tracking.correspondences import Pull, Target, pull
+from geomocap.tracking.deformation import BlockPattern, block_pattern, rotation_of, step, vector_of
+from geomocap.tracking.extremities import match_ends
+from geomocap.tracking.node_graph import NodeGraph
+from geomocap.tracking.node_settings import NodeTrackingSettings
+
+# Distance at which correspondences lose their weight (node spacings) and stiffness, step by step.
+NEAR = ((0.8, 8.0), (0.8, 4.0), (0.6, 4.0), (0.6, 2.0), (0.4, 2.0), (0.4, 1.0), (0.3, 1.0))
+FAR = ((2.0, 8.0), (1.5, 8.0), (1.2, 4.0), (0.8, 4.0), (0.6, 4.0), (0.6, 2.0), (0.4, 2.0), (0.4, 1.0), (0.3, 1.0))
+
+
+@dataclass(frozen=True)
+class State:
+    """Nodes in one frame.
+
+    Attributes
+    ----------
+    x : (N, 3) float, metres, world
+    R : (N, 3, 3) float
+        Rotation since the reference frame.
+    cost : float
+        Share of the surface that is not explained, and its strain.
+    """
+
+    x: np.ndarray
+    R: np.ndarray
+    cost: float = 0.0
+
+
+@dataclass(frozen=True)
+class CoarseTarget:
+    """A frame's points, thinned, and the ends of its limbs (E, 3), metres."""
+
+    target: Target
+    ends: np.ndarray
+
+
+@dataclass(frozen=True)
+class CoarseModel:
+    """The coarse graph of the reference surface.
+
+    Attributes
+    ----------
+    graph : NodeGraph
+    pattern : BlockPattern
+    ends : (E,) int
+        Samples at the ends of limbs.
+    tips : tuple of (n,) int
+        Samples that belong to each end.
+    point_spacing : float
+        Distance of neighbouring points of a frame, metres.
+    edge_weights : (E,) float
+        1, or 0 for edges that are false contacts.
+    """
+
+    graph: NodeGraph
+    pattern: BlockPattern
+    ends: np.ndarray
+    tips: tuple[np.ndarray, ...]
+    point_spacing: float
+    edge_weights: np.ndarray
+    settings: NodeTrackingSettings
+
+    @classmethod
+    def of(
+        cls, graph: NodeGraph, ends: np.ndarray, point_spacing: float, settings: NodeTrackingSettings
+    ) -> CoarseModel:
+        """Make the model from a graph and the positions of its limbs' ends (E, 3) in the reference frame."""
+        tree = cKDTree(graph.samples)
+        at = tree.query(ends)[1] if len(ends) else np.zeros(0, int)
+        tips = tuple(np.array(t, int) for t in tree.query_ball_point(graph.samples[at], 0.7 * graph.spacing))
+        return cls(graph, block_pattern(graph), at, tips, point_spacing, np.ones(len(graph.edges)), settings)
+
+    def start(self) -> State:
+        """Return the reference frame's state."""
+        return State(self.graph.nodes, np.tile(np.eye(3), (len(self.graph.nodes), 1, 1)))
+
+    def next_state(self, frame: CoarseTarget, last: State, before: State | None) -> State:
+        """Find the nodes in the next frame: from where they are expected and from where they were, near and far."""
+        starts = [last] if before is None else [self.expected(last, before), last]
+        found = []
+        for start in starts:
+            found.append(self.fit(frame, start, NEAR, False))
+            found.append(self.fit(frame, start, FAR, True))
+        return min(found, key=lambda s: s.cost)
+
+    def expected(self, last: State, before: State) -> State:
+        """Go on with the motion of the last frame, made as rigid as can be."""
+        m = self.settings.momentum
+        turn = vector_of(last.R @ before.R.transpose(0, 2, 1))
+        x, R = last.x + m * (last.x - before.x), rotation_of(m * turn) @ last.R
+        hold = np.tile(0.05 * np.eye(3), (len(self.graph.samples), 1, 1))
+        y = self.graph.deform(x, R)[0]
+        for _ in range(2):
+            now = self.graph.deform(x, R)[0]
+            x, R = self._step(x, R, hold, 0.05 * (now - y), 1.0)
+        return State(x, R)
+
+    def fit(self, frame: CoarseTarget, start: State, schedule: tuple[tuple[float, float], ...], by_ends: bool) -> State:
+        """Fit the graph to a frame.
+
+        Parameters
+        ----------
+        schedule : tuple of (scale, stiffness)
+            Scale in node spacings.
+        by_ends : bool
+            Whether limbs' ends are matched and pulled first.
+        """
+        x, R = start.x, start.R
+        if by_ends:
+            x, R = self._pull_ends(frame, x, R)
+        g, s = self.graph, self.settings
+        for scale, stiffness in schedule:
+            c = max(scale * g.spacing, 2 * self.point_spacing)
+            found = self._pull(frame.target, x, R, c)
+            x, R = self._step(x, R, found.A, found.b, stiffness)
+        found = self._pull(frame.target, x, R, max(0.3 * g.spacing, 2 * self.point_spacing))
+        strain = np.minimum(g.strain(x, R) / s.give, 1.0) ** 2
+        return State(x, R, found.energy + s.strain_cost * float(strain.mean()))
+
+    def _pull_ends(self, frame: CoarseTarget, x: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        y = self.graph.deform(x, R)[0]
+        extent = float(np.linalg.norm(np.ptp(self.graph.nodes, axis=0)))
+        own, seen = match_ends(y[self.ends], frame.ends, self.settings.end_reach * extent)
+        goal, weight = y.copy(), np.zeros(len(y))
+        for i, j in zip(own, seen, strict=True):
+            goal[self.tips[i]] += frame.ends[j] - y[self.ends[i]]
+            weight[self.tips[i]] = 1.0
+        A = weight[:, None, None] * np.eye(3)
+        for _ in range(4):
+            now = self.graph.deform(x, R)[0]
+            x, R = self._step(x, R, A, weight[:, None] * (now - goal), 1.0)
+        return x, R
+
+    def _pull(self, target: Target, x: np.ndarray, R: np.ndarray, scale: float) -> Pull:
+        y, normals = self.graph.deform(x, R)
+        tree = cKDTree(target.coordinates(scale))
+        s = self.settings
+        return pull(target, tree, y, normals, self.graph.features, scale, s.point_weight, s.feature_weight)
+
+    def _step(
+        self, x: np.ndarray, R: np.ndarray, A: np.ndarray, b: np.ndarray, stiffness: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        g = self.graph
+        soft = 1 / (1 + (g.strain(x, R) / (2 * self.settings.give)) ** 2) ** 2
+        share = len(g.samples) / len(g.nodes) / 4
+        weights = stiffness * self.settings.stiffness * share * soft * self.edge_weights
+        return step(g, self.pattern, x, R, weights, A, b, 60)
+
+
+def follow(model: CoarseModel, frames: list[CoarseTarget], reference: int, way: int) -> list[State]:
+    """States from the reference frame on, forwards (way 1) or backwards (way −1), the reference's first."""
+    states = [model.start()]
+    end = len(frames) if way > 0 else -1
+    for k in range(reference + way, end, way):
+        states.append(model.next_state(frames[k], states[-1], states[-2] if len(states) > 1 else None))
+    return states
+
+
+def mend(model: CoarseModel, frames: list[CoarseTarget], states: list[State], reference: int, way: int) -> list[State]:
+    """Try each frame again from the neighbours that follow it in time, and keep what costs less.
+
+    A limb that is lost where it moves fast is found again from the other side.
+    """
+    states = list(states)
+    T = len(states)
+    usual = float(np.median([s.cost for s in states]))
+    order = range(T - 2, -1, -1) if way < 0 else range(1, T)
+    for t in order:
+        if t == reference or states[t].cost < usual:
+            continue
+        near = states[t - way]
+        starts = [near]
+        if 0 <= t - 2 * way < T:
+            starts.append(model.expected(near, states[t - 2 * way]))
+        found = [model.fit(frames[t], s, NEAR, False) for s in starts]
+        best = min(found, key=lambda s: s.cost)
+        if best.cost < 0.97 * states[t].cost:
+            states[t] = best
+    return states

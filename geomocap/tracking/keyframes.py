@@ -1,0 +1,53 @@
+"""The frame to begin with: the one whose surface is stretched out most, so that least of it touches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from geomocap.tracking.node_graph import largest_parts
+
+
+def openness(graph: csr_matrix, landmarks: int = 24) -> float:
+    """Mean distance along the surface between far points and all points, metres.
+
+    Limbs that touch open short cuts, and limbs that have grown together lose surface: both make it smaller.
+    """
+    kept = largest_parts(graph, 0.02)
+    graph = graph[kept][:, kept]
+    distance = np.full(graph.shape[0], np.inf)
+    chosen = 0
+    total = 0.0
+    for k in range(landmarks + 1):
+        reached = dijkstra(graph, directed=False, indices=chosen)
+        finite = np.isfinite(reached)
+        if k:  # the first one only finds an end to begin with
+            total += float(reached[finite].mean())
+            distance = np.minimum(distance, reached)
+        else:
+            distance = -reached
+            distance[~finite] = -np.inf
+            chosen = int(distance.argmin()) if finite.all() else int(np.where(finite, reached, -1).argmax())
+            distance = np.full(graph.shape[0], np.inf)
+            continue
+        chosen = int(distance.argmax())
+    return total / landmarks
+
+
+def most_open(values: Sequence[float], frames: Sequence[int], n_frames: int) -> int:
+    """The frame with the greatest openness, those in the middle of the sequence first among near equals.
+
+    Parameters
+    ----------
+    values : sequence of float
+        Openness of each candidate, metres.
+    frames : sequence of int
+        Candidates.
+    n_frames : int
+        Length of the sequence.
+    """
+    middle = np.abs(np.asarray(frames) - n_frames / 2) / max(n_frames, 1)
+    return int(frames[int(np.argmax(np.asarray(values) * (1 - 0.02 * middle)))])

@@ -1,0 +1,37 @@
+"""Settings of node tracking."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from geomocap.settings import Settings
+
+
+class NodeTrackingSettings(Settings):
+    """How nodes of a surface are followed through point sets."""
+
+    nodes: int = Field(1000, ge=20, description="nodes to follow")
+    coarse_nodes: int = Field(220, ge=10, description="nodes of the coarse graph that finds the motion first")
+    points: int = Field(5000, ge=100, description="points of a frame that are used (points)")
+    coarse_points: int = Field(
+        1800, ge=100, description="points of a frame that the coarse graph is fitted to (points)"
+    )
+    neighbours: int = Field(9, ge=4, le=60, description="neighbours that make a point's normal")
+    stiffness: float = Field(
+        0.3, gt=0, description="resistance to bending and stretching, relative to the points' pull"
+    )
+    give: float = Field(0.3, gt=0, description="strain at which an edge gives way (share of its length)")
+    strain_cost: float = Field(1.0, ge=0, description="cost of strain relative to that of unexplained points")
+    point_weight: float = Field(0.05, ge=0, le=1, description="pull along the surface relative to that across it")
+    feature_weight: float = Field(1.0, ge=0, description="pull of features (colours) relative to that of the geometry")
+    feature_scale: float = Field(0.15, gt=0, description="difference of features that separates points")
+    momentum: float = Field(0.9, ge=0, le=1, description="share of the last motion that is expected to go on")
+    end_reach: float = Field(0.25, ge=0, description="limbs' ends are looked for within (share of the extent)")
+    lost_below: float = Field(
+        0.1, ge=0, le=1, description="support by a frame's points below which a node is lost (share)"
+    )
+    slide: float = Field(0.5, gt=0, description="standard deviation of a sliding that can't be seen (node spacings)")
+    noise: float = Field(
+        0.05, gt=0, description="least standard deviation of a node across the surface (node spacings)"
+    )
+    seed: int = Field(0, ge=0, description="seed of the thinning of points")

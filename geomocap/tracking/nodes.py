@@ -1,0 +1,189 @@
+"""Tracking nodes of a surface through a sequence of point sets that are sampled afresh in each frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from geomocap.errors import GeometryError
+from geomocap.progress import Progress, silent
+from geomocap.scheduling import map_items, threads
+from geomocap.tracking.coarse_motion import CoarseModel, CoarseTarget, State, follow, mend
+from geomocap.tracking.correspondences import Target, pull
+from geomocap.tracking.deformation import block_pattern, step
+from geomocap.tracking.extremities import extremities
+from geomocap.tracking.keyframes import most_open, openness
+from geomocap.tracking.node_graph import farthest_points, largest_parts, node_graph
+from geomocap.tracking.node_settings import NodeTrackingSettings
+from geomocap.tracking.surface_points import PointSet, point_set, surface_graph
+from geomocap.tracking.uncertainty import node_covariance, patch_mean
+
+Points = Callable[[int], np.ndarray]
+"""Points of a frame, (M, 3) float, metres; or their features, (M, F) float."""
+
+FINE = ((1.0, 2.0), (0.8, 1.0), (0.6, 1.0), (0.6, 1.0))
+"""Scales in node spacings and stiffness of the fine fit, step by step."""
+END_SIZE = 0.12
+"""How far an end of a limb stands out, share of the extent."""
+
+
+@dataclass(frozen=True)
+class NodeTracks:
+    """Tracked nodes.
+
+    Attributes
+    ----------
+    positions : (N, T, 3) float, metres, world
+        NaN where a node is lost.
+    rotations : (N, T, 3, 3) float
+        Rotation of the surface around each node since the reference frame, world axes.
+    covariance : (N, T, 3, 3) float, m²
+        Of the positions: large along directions in which the surface may slide unseen.
+    reference_frame : int
+    reference : (N, 3) float, metres
+        Positions in the reference frame, complete.
+    edges : (E, 2) int
+        Neighbours on the surface.
+    """
+
+    positions: np.ndarray
+    rotations: np.ndarray
+    covariance: np.ndarray
+    reference_frame: int
+    reference: np.ndarray
+    edges: np.ndarray
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """Standard deviation of a coordinate, root mean square of the three directions, (N, T) float, metres."""
+        return np.sqrt(np.trace(self.covariance, axis1=2, axis2=3) / 3)
+
+
+class NodeModel:
+    """The reference surface with its coarse and its fine graph."""
+
+    def __init__(self, surface: PointSet, settings: NodeTrackingSettings):
+        self.settings = settings
+        graph = surface_graph(surface.positions, surface.normals, 8)
+        kept = np.flatnonzero(largest_parts(graph, 0.01))
+        surface, graph = surface.at(kept), graph[kept][:, kept]
+        chosen = farthest_points(surface.positions, settings.nodes)
+        coarse = chosen[: min(settings.coarse_nodes, len(chosen))]
+        self.graph = node_graph(surface, graph, chosen, 4 * settings.nodes)
+        self.pattern = block_pattern(self.graph)
+        self.patches = patch_mean(self.graph)
+        carried = node_graph(surface, graph, coarse, len(surface))
+        self.spacing = float(np.median(cKDTree(surface.positions).query(surface.positions, 2)[0][:, 1]))
+        extent = float(np.linalg.norm(np.ptp(surface.positions, axis=0)))
+        ends = surface.positions[extremities(graph, END_SIZE * extent)]
+        coarse_graph = node_graph(surface, graph, coarse, 6 * len(coarse))
+        self.coarse = CoarseModel.of(coarse_graph, ends, self.spacing, settings)
+        # fine nodes hang on the coarse graph as its samples do
+        where = cKDTree(carried.samples).query(self.graph.nodes)[1]
+        self.carrier, self.carrier_weights = carried.binding[where], carried.weights[where]
+
+    def refine(self, target: Target, coarse: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Fit the fine graph to a frame from the coarse graph's state; positions, rotations, covariances."""
+        arm = self.graph.nodes[:, None] - self.coarse.graph.nodes[self.carrier]
+        moved = coarse.x[self.carrier] + np.matmul(coarse.R[self.carrier], arm[..., None])[..., 0]
+        w = self.carrier_weights
+        x = (w[..., None] * moved).sum(axis=1)
+        R = _nearest_rotations((w[..., None, None] * coarse.R[self.carrier]).sum(axis=1))
+        h, s, g = self.graph.spacing, self.settings, self.graph
+        for scale, stiffness in FINE:
+            c = max(scale * h, 1.5 * self.spacing)
+            y, normals = g.deform(x, R)
+            tree = cKDTree(target.coordinates(c))
+            found = pull(target, tree, y, normals, g.features, c, s.point_weight, s.feature_weight)
+            soft = 1 / (1 + (g.strain(x, R) / s.give) ** 2) ** 2
+            share = len(g.samples) / len(g.nodes) / 4
+            x, R = step(g, self.pattern, x, R, stiffness * s.stiffness * share * soft, found.A, found.b, 60)
+        y, normals = g.deform(x, R)
+        tree = cKDTree(target.coordinates(c))
+        found = pull(target, tree, y, normals, g.features, c, s.point_weight, 0.0)
+        covariance, support = node_covariance(
+            self.patches, normals, found.support, found.across, s.slide * h, s.noise * h
+        )
+        return np.where((support >= s.lost_below)[:, None], x, np.nan), R, covariance
+
+
+def _nearest_rotations(M: np.ndarray) -> np.ndarray:
+    U, _, Vt = np.linalg.svd(M)
+    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
+    return U @ Vt
+
+
+def track_nodes(
+    points: Points,
+    n_frames: int,
+    settings: NodeTrackingSettings | None = None,
+    features: Points | None = None,
+    progress: Progress = silent,
+    executor: Executor | None = None,
+) -> NodeTracks:
+    """Follow nodes of a surface through all frames, forwards and backwards from the most open one.
+
+    Parameters
+    ----------
+    points : callable
+        `points(frame) -> (M, 3) float`, metres, in any order and sampled afresh in each frame.
+    n_frames : int
+    settings : NodeTrackingSettings, optional
+    features : callable, optional
+        `features(frame) -> (M, F) float`, what else is known of each point, such as its colour between 0 and 1.
+    progress : callable, optional
+    executor : Executor, optional
+        Threads; the cores' number of them if not given.
+
+    Raises
+    ------
+    GeometryError
+        If there are no frames or a frame has too few points.
+    """
+    settings = settings or NodeTrackingSettings()
+    if n_frames < 1:
+        raise GeometryError("nodes can't be tracked through a sequence without frames")
+    if executor is None:
+        with threads() as own:
+            return track_nodes(points, n_frames, settings, features, progress, own)
+
+    def prepare(frame: int) -> PointSet:
+        more = None if features is None else features(frame)
+        return point_set(points(frame), settings.points, settings.neighbours, settings.seed + frame, more)
+
+    frames = list(map_items(prepare, list(range(n_frames)), executor, "points", progress))
+    candidates = list(range(0, n_frames, max(1, n_frames // 30)))
+
+    def judge(frame: int) -> float:
+        return openness(surface_graph(frames[frame].positions, frames[frame].normals, 8))
+
+    reference = most_open(list(map_items(judge, candidates, executor)), candidates, n_frames)
+    scales = np.full(frames[reference].features.shape[1], settings.feature_scale)
+    model = NodeModel(frames[reference], settings)
+    extent = float(np.linalg.norm(np.ptp(frames[reference].positions, axis=0)))
+
+    def coarsen(frame: int) -> CoarseTarget:
+        few = frames[frame].thinned(settings.coarse_points, settings.seed + frame)
+        graph = surface_graph(few.positions, few.normals, 8)
+        kept = np.flatnonzero(largest_parts(graph, 0.01))
+        few, graph = few.at(kept), graph[kept][:, kept]
+        return CoarseTarget(Target(few, scales), few.positions[extremities(graph, END_SIZE * extent)])
+
+    coarse = list(map_items(coarsen, list(range(n_frames)), executor, "ends of limbs", progress))
+    ahead, back = map_items(
+        lambda way: follow(model.coarse, coarse, reference, way), [1, -1], executor, "coarse motion", progress
+    )
+    states = back[:0:-1] + ahead
+    for way in (-1, 1):
+        states = mend(model.coarse, coarse, states, reference, way)
+
+    def refine(frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return model.refine(Target(frames[frame], scales), states[frame])
+
+    fine = list(map_items(refine, list(range(n_frames)), executor, "nodes", progress))
+    x, R, covariance = (np.stack([f[k] for f in fine], axis=1) for k in range(3))
+    return NodeTracks(x, R, covariance, reference, model.graph.nodes, model.graph.edges)

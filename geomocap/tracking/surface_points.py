@@ -1,0 +1,150 @@
+"""Point sets of a surface: normals turned outwards, thinning, and the graph along which distances are geodesic."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.spatial import cKDTree
+
+from geomocap.errors import GeometryError
+
+
+@dataclass(frozen=True)
+class PointSet:
+    """Points of one frame's surface.
+
+    Attributes
+    ----------
+    positions : (M, 3) float, metres, world
+    normals : (M, 3) float
+        Unit normals, outwards.
+    features : (M, F) float
+        What else is known of each point, such as its colour; F may be 0.
+    gradients : (M, F, 3) float
+        How the features change along the surface, per metre.
+    """
+
+    positions: np.ndarray
+    normals: np.ndarray
+    features: np.ndarray
+    gradients: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def at(self, kept: np.ndarray) -> PointSet:
+        """Return the points at some indices."""
+        return PointSet(self.positions[kept], self.normals[kept], self.features[kept], self.gradients[kept])
+
+    def thinned(self, count: int, seed: int) -> PointSet:
+        """Return at most `count` points, drawn at random."""
+        if len(self) <= count:
+            return self
+        return self.at(np.sort(np.random.default_rng(seed).permutation(len(self))[:count]))
+
+
+def point_set(
+    points: np.ndarray, n_points: int, neighbours: int, seed: int = 0, features: np.ndarray | None = None
+) -> PointSet:
+    """Make a point set of at most `n_points`, normals and gradients measured on all points.
+
+    Parameters
+    ----------
+    points : (M, 3) float, metres
+    n_points : int
+        Points to keep, drawn at random.
+    neighbours : int
+        Neighbours that make a normal.
+    seed : int
+    features : (M, F) float, optional
+
+    Raises
+    ------
+    GeometryError
+        If there are fewer points than a normal needs.
+    """
+    points = np.ascontiguousarray(points, float)
+    if len(points) <= neighbours:
+        raise GeometryError(f"a surface of {len(points)} points has no normals; more than {neighbours} are needed")
+    if features is None:
+        features = np.zeros((len(points), 0))
+    if len(points) > 3 * n_points:
+        chosen = np.sort(np.random.default_rng(seed).permutation(len(points))[: 3 * n_points])
+        points, features = points[chosen], features[chosen]
+    near = cKDTree(points).query(points, neighbours + 1)[1]
+    normals = oriented_normals(points, near)
+    gradients = feature_gradients(points, normals, near, features)
+    return PointSet(points, normals, np.asarray(features, float), gradients).thinned(n_points, seed)
+
+
+def oriented_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Normals by principal components, oriented along a minimum spanning tree and then outwards.
+
+    Source: H. Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992, sections 3.2 and 3.3.
+
+    Parameters
+    ----------
+    points : (M, 3) float, metres
+    near : (M, k) int
+        Each point's nearest points, itself first.
+    """
+    local = points[near] - points[near].mean(axis=1, keepdims=True)
+    normals = np.linalg.eigh(np.einsum("mki,mkj->mij", local, local))[1][:, :, 0]
+    M, k = near.shape
+    i, j = np.repeat(np.arange(M), k - 1), near[:, 1:].ravel()
+    cost = 1 - np.abs((normals[i] * normals[j]).sum(axis=1)) + 1e-6
+    graph = csr_matrix((cost, (i, j)), (M, M))
+    tree = minimum_spanning_tree(graph.maximum(graph.T))
+    tree = tree + tree.T
+    n_parts, part = connected_components(tree, directed=False)
+    for first in np.unique(part, return_index=True)[1][:n_parts]:
+        members, parent = breadth_first_order(tree, first, directed=False)
+        _follow(normals, members, parent)
+        # the volume that a closed surface encloses is positive where normals point outwards
+        outward = ((points[members] - points[members].mean(axis=0)) * normals[members]).sum()
+        if outward < 0:
+            normals[members] *= -1
+    return normals
+
+
+def _follow(normals: np.ndarray, order: np.ndarray, parent: np.ndarray) -> None:
+    """Turn each normal to its parent's side, in the order of the tree; in place."""
+    sign = np.ones(len(normals))
+    agree = np.where((normals[order[1:]] * normals[parent[order[1:]]]).sum(axis=1) < 0, -1.0, 1.0)
+    for child, s in zip(order[1:].tolist(), agree.tolist(), strict=True):
+        sign[child] = sign[parent[child]] * s
+    normals[order] *= sign[order, None]
+
+
+def feature_gradients(points: np.ndarray, normals: np.ndarray, near: np.ndarray, features: np.ndarray) -> np.ndarray:
+    """Gradients of features in the tangent plane by least squares, (M, F, 3), per metre.
+
+    Source: J. Park, Q.-Y. Zhou, V. Koltun, "Colored point cloud registration revisited", ICCV 2017, section 4.1.
+    """
+    if features.shape[1] == 0:
+        return np.zeros((len(points), 0, 3))
+    offset = points[near] - points[:, None]
+    offset -= np.einsum("mki,mi->mk", offset, normals)[..., None] * normals[:, None]
+    A = np.einsum("mki,mkj->mij", offset, offset)
+    scale = np.trace(A, axis1=1, axis2=2)[:, None, None]
+    # the normal direction is held at zero
+    A = A + scale * (np.einsum("mi,mj->mij", normals, normals) + 1e-3 * np.eye(3))
+    difference = features[near] - features[:, None]
+    return np.linalg.solve(A, np.einsum("mki,mkf->mif", offset, difference)).transpose(0, 2, 1)
+
+
+def surface_graph(points: np.ndarray, normals: np.ndarray, neighbours: int) -> csr_matrix:
+    """Symmetric graph of neighbouring points on the same side of the surface, weighted by distance (M, M).
+
+    Points whose normals oppose each other, as on two limbs that touch, are no neighbours.
+    """
+    M = len(points)
+    distance, near = cKDTree(points).query(points, neighbours + 1)
+    i, j, d = np.repeat(np.arange(M), neighbours), near[:, 1:].ravel(), distance[:, 1:].ravel()
+    reach = 2.0 * np.median(distance[:, -1])
+    keep = (d < reach) & ((normals[i] * normals[j]).sum(axis=1) > -0.2)
+    graph = coo_matrix((np.maximum(d[keep], 1e-9), (i[keep], j[keep])), (M, M)).tocsr()
+    return graph.maximum(graph.T)
