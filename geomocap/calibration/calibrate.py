@@ -317,7 +317,9 @@ def calibrate_bar(
     checkable = (sightings.counts >= 2) & (fitting.sum(axis=0) - fitting >= 2)
     lost = (checkable & ~fitting).sum(axis=1) / np.maximum(checkable.sum(axis=1), 1)
     out = found.rejected.sum(axis=(1, 2)) / np.maximum((found.chosen >= 0).sum(axis=(1, 2)), 1)
-    verdict = judge(adjusted, precision, covered, moved, how, lengths, datum, lost, out)
+    verdict = judge(
+        adjusted, precision, covered, moved, how, lengths, datum, lost, out, adjusted.sigma0 * found.sigma_factor
+    )
     progress("calibrate", steps, steps)
     return Calibration(
         adjusted.network.rig(),

@@ -45,7 +45,7 @@ def shifts(network: Network, radius: float) -> np.ndarray:
     other = np.cross(axis, across)
     sine = np.minimum(radius / distance, 0.5)
     slope = sine / np.sqrt(1 - sine**2)
-    angles = np.arange(12) * (np.pi / 6)
+    angles = np.arange(32) * (np.pi / 16)
     rim = axis[:, None] + slope[:, :, None] * (
         np.cos(angles)[:, None] * across[:, None] + np.sin(angles)[:, None] * other[:, None]
     )

@@ -319,14 +319,9 @@ def choose_model(estimate: Estimate, prior: Prior, settings: BarSettings) -> tup
         with_k3 = adjust(adjusted.network, (*free, *interior_indices(("k3",))), prior, adjusted.loss)
         gain = (adjusted.cost - with_k3.cost) / with_k3.sigma0**2
         # Each camera's k3 must earn its place against the number of observations (Schwarz's criterion)
-        if gain > len(names) * np.log(2 * len(adjusted.network.bar)) and _effect(with_k3, adjusted) > 0.05:
+        if gain > len(names) * np.log(2 * len(adjusted.network.bar)) and adjusted.sigma0 > 1.02 * with_k3.sigma0:
             adjusted = with_k3
     return adjusted, tests
-
-
-def _effect(a: Adjusted, b: Adjusted) -> float:
-    """Root mean square difference of two adjustments' residuals, pixels."""
-    return float(np.sqrt(np.mean((a.residuals - b.residuals) ** 2)))
 
 
 def tests_of(adjusted: Adjusted, parameters: tuple[int, ...]) -> tuple[Significance, ...]:

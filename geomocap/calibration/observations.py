@@ -97,7 +97,7 @@ def sightings_of(
     observed: Observed,
     pairs: Sequence[tuple[str, str]] | None = None,
     sizes: Mapping[str, tuple[int, int]] | None = None,
-    sigma: float = 0.2,
+    sigma: float = 0.5,
     cameras: Sequence[str] | None = None,
 ) -> Sightings:
     """Take two points of a table as the ends of a bar.

@@ -40,6 +40,7 @@ def judge(
     datum: Datum,
     lost: np.ndarray,
     rejected: np.ndarray,
+    sigma0: float,
 ) -> Verdict:
     """Judge a calibration.
 
@@ -49,6 +50,8 @@ def judge(
         Share of each camera's frames in which it has targets, but none that fits the bar found by the others.
     rejected : (C,) float
         Share of each camera's fitting targets that were left out as outliers.
+    sigma0 : float
+        For the targets' a-priori standard deviations.
     """
     grave: list[str] = []
     doubtful: list[str] = []
@@ -84,9 +87,9 @@ def judge(
             )
         if rejected[k] > 0.1:
             doubtful.append(f"camera {name}: {100 * rejected[k]:.0f} % of its targets were left out as outliers")
-    if adjusted.sigma0 > 3:
+    if sigma0 > 4:
         doubtful.append(
-            f"residuals are {adjusted.sigma0:.1f} times what the targets' precision lets expect: "
+            f"residuals are {sigma0:.1f} times what the targets' precision lets expect: "
             "bar moved while exposed, cameras not quite synchronized, or targets partly hidden"
         )
     if len(n.bars) < 30:

@@ -15,6 +15,7 @@ import tomli_w
 from geomocap.calibration.calibrate import Calibration, calibrate_bar
 from geomocap.calibration.from_capture import calibrate_capture
 from geomocap.calibration.initial import pair_all
+from geomocap.calibration.recording import Recording, measure
 from geomocap.calibration.settings import BarSettings, TargetSettings
 from geomocap.cameras import Rig
 from geomocap.errors import CalibrationError, CaptureError
@@ -24,6 +25,7 @@ from tests.geomocap.bar_scenes import (
     joined,
     knocked,
     object_errors,
+    random_bars,
     render,
     seen,
     three_cameras,
@@ -190,3 +192,38 @@ def test_recordings_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "bar" / "bar.toml").unlink()
     with pytest.raises(CaptureError, match="metres between the target centres"):
         calibrate_capture(tmp_path)
+
+
+def test_a_stronger_lens_model_only_where_it_is_needed() -> None:
+    scene = three_cameras(6, 60)
+    cameras = []
+    for _ in range(3):
+        params = [430.0, 431.0, 322.0, 238.0, -0.2, 0.08, 5e-4, -5e-4, -0.06, 0.0, 0.0, 0.0]
+        cameras.append(pycolmap.Camera(model="FULL_OPENCV", width=640, height=480, params=params))
+    rig = Rig(scene.rig.names, tuple(cameras), np.array(scene.rig.cam_from_world))
+    half, target = np.array([1.1, 0.9, 0.8]), np.array([0, 0, 1.0])
+    wide = replace(scene, rig=rig, bars=random_bars(np.random.default_rng(1), rig, 60, 0.5, half, target, 3))
+    sightings = seen(wide, np.random.default_rng(0), NOISE)
+    calibration = calibrate_bar(sightings, wide.length, FLAT, length_sigma=1e-5)
+    assert all(c.model.name == "FULL_OPENCV" for c in calibration.rig.cameras)
+    np.testing.assert_allclose([c.params[8] for c in calibration.rig.cameras], -0.06, atol=0.02)
+    check(wide, calibration)
+    plain = FLAT.model_copy(update={"model": "OPENCV"})
+    fixed = calibrate_bar(sightings, wide.length, plain, length_sigma=1e-5)
+    assert fixed.sigma0 > calibration.sigma0
+    assert any(t.significant for t in fixed.tests if t.parameter == "k3")
+
+
+def test_videos_are_read_frame_by_frame(tmp_path: Path) -> None:
+    scene = three_cameras(6, 5)
+    (tmp_path / "bar").mkdir()
+    for c, name in enumerate(scene.rig.names):
+        writer = cv2.VideoWriter(str(tmp_path / "bar" / f"{name}.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 10, (640, 480))
+        for t in range(5):
+            writer.write(render(scene, t, c, np.random.default_rng(t), 0.0)[..., ::-1])
+        writer.release()
+    recording = Recording.open(tmp_path / "bar", length=scene.length)
+    sightings = measure(recording, TargetSettings(background_frames=5))
+    truth = scene.rig.project(scene.bars.reshape(-1, 3)).reshape(3, 5, 2, 2)
+    near = np.linalg.norm(sightings.pixels[:, :, :, None] - truth[:, :, None], axis=-1).min(axis=2)
+    assert (near[scene.visible()] < 0.3).mean() > 0.9
