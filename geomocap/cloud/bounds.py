@@ -53,6 +53,7 @@ def hull_depth(rig: Rig, camera: int, shape: tuple[int, int], hull: Voxels) -> n
         size = rig.cameras[camera].mean_focal_length() * hull.voxel_size / float(np.median(depth[known][inside]))
         reach = 2 * int(np.ceil(size)) + 1
         image = np.asarray(cv2.erode(image, np.ones((reach, reach), np.uint8)), dtype=np.float32)
+        image[image > 1e30] = np.inf
     return image
 
 

@@ -95,8 +95,8 @@ def match_groups(rig: Rig, settings: GroupSettings | None = None) -> MatchGroups
         off = angles[~np.eye(len(rig), dtype=bool)]
         raise CalibrationError(
             f"no two cameras can be matched: their viewing directions differ by "
-            f"{off.min(initial=180):.0f}° at least, expected {settings.least_angle:g}° to {settings.greatest_angle:g}°; "
-            "widen groups.least_angle and groups.greatest_angle or add cameras between"
+            f"{off.min(initial=180):.0f}° at least, expected {settings.least_angle:g}° to "
+            f"{settings.greatest_angle:g}°; widen groups.least_angle and groups.greatest_angle or add cameras between"
         )
     maps = tuple(None if c.is_undistorted() else rig.undistortion_map(i) for i, c in enumerate(rig.cameras))
     return MatchGroups(pinhole, maps, tuple(groups))

@@ -117,8 +117,8 @@ def _cell_at(layer: Layer, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     number = layer.grid.image(np.arange(len(layer.grid)), -1)
     with np.errstate(invalid="ignore"):
         place = np.rint((pixels - 0.5) / layer.step - 0.5)
-    inside: np.ndarray = np.isfinite(place).all(axis=1)
-    inside[inside] &= ((place[inside] >= 0) & (place[inside] < np.array(number.shape)[::-1])).all(axis=1)
+    with np.errstate(invalid="ignore"):
+        inside = np.asarray(((place >= 0) & (place < np.array(number.shape)[::-1])).all(axis=1))
     cell = np.full(len(pixels), -1, np.int64)
     column, row = place[inside].astype(int).T
     cell[inside] = number[row, column]

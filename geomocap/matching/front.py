@@ -247,7 +247,7 @@ class Front:
             ahead = neighbours[ahead, direction]
 
     def fill_holes(self, passes: int) -> None:
-        """Try what is left from all directions: from the mean plane of all matched neighbours, then from each of them."""
+        """Try what is left from all directions: from the mean plane of all matched neighbours, then from each."""
         at = self.grid.neighbours
         fresh = self.matched
         for _ in range(passes):

@@ -185,7 +185,7 @@ def _refine(
 def tilt_planes(
     flat, seen, shapes, starts, transfers, points, planes, focal, radius, depth_pixels, tilt, tilts, correlation
 ):
-    """Turn planes (N, PLANE) about their points (N, 2) to where the images correlate best; write the correlations (N,)."""
+    """Turn planes (N, PLANE) about their points (N, 2) to where the images correlate best; write correlations (N,)."""
     images = len(transfers)
     side = 2 * tilts + 1
     for s in prange(len(points)):
