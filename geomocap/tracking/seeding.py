@@ -12,13 +12,15 @@ from geomocap.tracking.tracking_settings import TrackingSettings
 _FIT_VOXELS = 4.5  # radius of the piece of surface that gives a patch its shape, voxels
 _FACING = 0.35
 _HULL_SLACK = 3.0  # voxels that a seed may lie behind the drawn surface
+_ROUNDS = 3
+_PACKING = 0.7  # points placed at random at least r apart, as many as fit: 0.7 a square of r
 _SWEEP_PX = 1.0  # step of the search along the viewing ray, pixels
 
 
 def seed_spacing(view: FrameViews, n_patches: int) -> float:
     """Return the distance of seeds, metres, at which about `n_patches` cover the surface of a frame."""
     area = 0.75 * len(view.surface) * view.voxel_size**2  # a slanted surface has more voxels than squares
-    return float(np.sqrt(area / (0.8 * n_patches)))
+    return float(np.sqrt(_PACKING * area / n_patches))
 
 
 def spread(points: np.ndarray, spacing: float, taken: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -102,6 +104,8 @@ def seed_patches(
 ) -> Patches:
     """Place new patches where a frame's surface has none.
 
+    Places where cameras don't agree are tried again a little beside, twice.
+
     Parameters
     ----------
     view : FrameViews
@@ -112,15 +116,28 @@ def seed_patches(
     settings : TrackingSettings
     rng : numpy.random.Generator
     """
+    M, C, L = (2 * settings.radius_px + 1) ** 2, view.count, len(view.levels)
+    patches = Patches.empty(M, C, L)
+    tried = np.zeros(len(view.surface), bool)
+    for _ in range(_ROUNDS):
+        candidates = np.flatnonzero(~tried)
+        there = np.concatenate([taken, patches.positions])
+        chosen = candidates[spread(view.surface[candidates], spacing, there, rng)]
+        if not len(chosen):
+            break
+        tried[chosen] = True
+        patches = patches.join(_seed_at(view.surface[chosen], view, settings))
+    return patches
+
+
+def _seed_at(points: np.ndarray, view: FrameViews, settings: TrackingSettings) -> Patches:
+    """Make patches at points of the surface (N, 3), as far as two cameras agree on them."""
     C, L = view.count, len(view.levels)
-    chosen = spread(view.surface, spacing, taken, rng)
-    if not len(chosen):
-        return Patches.empty((2 * settings.radius_px + 1) ** 2, C, L)
-    positions, frames, curvature = surface_frames(view, view.surface[chosen])
+    positions, frames, curvature = surface_frames(view, points)
     # a patch belongs to the camera that faces it best; it needs a second one
     cosine = facings(positions, frames[:, :, 2], view)
     seen = _seen(view, positions) & (cosine > _FACING)
-    good = seen.sum(axis=1) >= settings.n_views
+    good = seen.sum(axis=1) >= max(settings.n_views, 2)
     positions, frames, curvature, cosine, seen = (a[good] for a in (positions, frames, curvature, cosine, seen))
     reference = np.where(seen, cosine, -1).argmax(axis=1)
     rows = np.arange(len(positions))
@@ -129,9 +146,8 @@ def seed_patches(
     only = np.zeros((len(blank), C), bool)
     only[rows, reference] = True
     patches = with_templates(blank, only, view)
-    keep = patches.has.any(axis=1)
-    patches, seen, reference = patches.select(keep), seen[keep], reference[keep]
-    return _lock(patches, seen, reference, view, settings)
+    keep = np.flatnonzero(patches.has.any(axis=1))
+    return _lock(patches.select(keep), seen[keep], reference[keep], view, settings)
 
 
 def _lock(
@@ -205,8 +221,9 @@ def _outward(view: FrameViews, points: np.ndarray, tree: cKDTree) -> np.ndarray:
 
 
 def _frame_of(normal: np.ndarray) -> np.ndarray:
-    """Right-handed axes (3, 3) with the normal as third column."""
-    other = np.eye(3)[np.argmin(np.abs(normal))]
-    first = np.cross(other, normal)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(normal, first), normal], axis=1)
+    """Right-handed axes (3, 3) with the unit normal as third column (Duff et al. 2017)."""
+    x, y, z = normal
+    sign = 1.0 if z >= 0 else -1.0
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return np.array([[1 + sign * x * x * a, b, x], [sign * b, sign + y * y * a, y], [-sign * x, -y, z]])

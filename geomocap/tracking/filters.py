@@ -1,0 +1,148 @@
+"""Filters of trajectories: too fast, accelerated too much, unlike the motion around them; each with its reason.
+
+What is measured from the first bad frame on, counted away from the frame in which the point was placed, is cut off;
+trajectories that become too short are removed (D'Apuzzo 2003, thresholds on velocity and acceleration and local
+uniformity of the trajectories in space and time). The motion around a point is that of its neighbours as small rigid
+bodies, so that a turning limb is uniform although no two of its points move alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import Field
+from scipy.spatial import cKDTree
+
+from geomocap.settings import Settings
+from geomocap.tracking.smoothing import Motion
+from geomocap.tracking.trajectories import REASONS, TOO_FAST, TOO_JERKY, TOO_SHORT, UNLIKE, Trajectories
+
+_QUANTILE = 0.995
+_NEIGHBOURS = 8
+_AGREEING = 3
+
+
+class FilterSettings(Settings):
+    """Which trajectories are cut or removed."""
+
+    fastest: float | None = Field(None, gt=0, description="Highest speed (m/s); from the data if not given")
+    acceleration: float | None = Field(
+        None, gt=0, description="Highest acceleration (m/s²); from the data if not given"
+    )
+    beyond_data: float = Field(
+        2.0, gt=1, description="Limits from the data: so many times what 99.5 % of the points don't exceed"
+    )
+    window: int = Field(4, ge=1, description="Frames over which the motion is compared with that around it")
+    unlike: float = Field(0.015, gt=0, description="Largest distance from where the motion around it leads (m)")
+    least_frames: int = Field(3, ge=1, description="Frames that a trajectory needs")
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """What the filters left.
+
+    Attributes
+    ----------
+    trajectories : Trajectories
+        Those left, with the filters' reasons among theirs.
+    kept : (M,) int
+        Row of each in the unfiltered trajectories.
+    cut : dict
+        For each reason, how many trajectories it cut or removed.
+    fastest, acceleration : float
+        Limits that were used, m/s and m/s².
+    """
+
+    trajectories: Trajectories
+    kept: np.ndarray
+    cut: dict[str, int]
+    fastest: float
+    acceleration: float
+
+
+def filter_trajectories(tracks: Trajectories, motion: Motion, settings: FilterSettings | None = None) -> Filtered:
+    """Cut trajectories where they can't be true.
+
+    Parameters
+    ----------
+    tracks : Trajectories
+    motion : Motion
+        Smoothed motion of the same points.
+    settings : FilterSettings, optional
+    """
+    settings = settings or FilterSettings()
+    speed = np.linalg.norm(motion.velocities, axis=2)
+    change = np.linalg.norm(motion.accelerations, axis=2)
+    fastest = settings.fastest or _limit(speed, settings.beyond_data)
+    acceleration = settings.acceleration or _limit(change, settings.beyond_data)
+    with np.errstate(invalid="ignore"):
+        tests = (
+            (TOO_FAST, speed > fastest),
+            (TOO_JERKY, change > acceleration),
+            (UNLIKE, departure(tracks, settings.window) > settings.unlike),
+        )
+    cut = {}
+    for reason, bad in tests:
+        tracks, count = _truncate(tracks, bad & tracks.measured, reason)
+        cut[REASONS[reason]] = count
+    kept = np.flatnonzero(tracks.lengths >= settings.least_frames)
+    cut[REASONS[TOO_SHORT]] = len(tracks) - len(kept)
+    return Filtered(tracks.select(kept), kept, cut, fastest, acceleration)
+
+
+def departure(tracks: Trajectories, window: int) -> np.ndarray:
+    """Measure how far points come from where the motion around them leads.
+
+    For each frame t the motion from t − `window` is compared with the rigid motions of the eight nearest points; the
+    third best counts, as a point at a joint shares its motion with the few on its own side.
+
+    Parameters
+    ----------
+    tracks : Trajectories
+    window : int
+        Frames.
+
+    Returns
+    -------
+    (N, T) float
+        Metres; NaN where too few neighbours are measured in both frames. The larger one of the comparisons with the
+        frame before and the frame after.
+    """
+    N, T = tracks.positions.shape[:2]
+    out = np.full((N, T), np.nan)
+    for t in range(window, T):
+        rows = np.flatnonzero(tracks.measured[:, t] & tracks.measured[:, t - window])
+        if len(rows) <= _NEIGHBOURS:
+            continue
+        old, new = tracks.positions[rows, t - window], tracks.positions[rows, t]
+        near = cKDTree(old).query(old, _NEIGHBOURS + 1)[1][:, 1:]
+        turn = tracks.rotations[rows, t] @ np.swapaxes(tracks.rotations[rows, t - window], 1, 2)
+        led = new[near] + np.einsum("nkij,nkj->nki", turn[near], old[:, None] - old[near])
+        away = np.sort(np.linalg.norm(led - new[:, None], axis=2), axis=1)[:, _AGREEING - 1]
+        # the frame farther from where a point was placed is the one in doubt
+        later = np.abs(t - tracks.placed[rows]) >= np.abs(t - window - tracks.placed[rows])
+        frame = np.where(later, t, t - window)
+        out[rows, frame] = np.fmax(out[rows, frame], away)
+    return out
+
+
+def _limit(values: np.ndarray, factor: float) -> float:
+    known = values[np.isfinite(values)]
+    return factor * float(np.quantile(known, _QUANTILE)) if len(known) else float("inf")
+
+
+def _truncate(tracks: Trajectories, bad: np.ndarray, reason: int) -> tuple[Trajectories, int]:
+    """Cut what lies beyond bad frames, seen from the frame of placing; return how many trajectories were cut."""
+    frames = np.arange(tracks.n_frames)
+    after = frames[None] >= tracks.placed[:, None]
+    behind = np.logical_or.accumulate(bad & after, axis=1)
+    before = np.logical_or.accumulate((bad & ~after)[:, ::-1], axis=1)[:, ::-1]
+    drop = behind | before
+    cut_after, cut_before = behind.any(axis=1), before.any(axis=1)
+    rest = replace(
+        tracks.without(drop),
+        end_reason=np.where(cut_after, reason, tracks.end_reason),
+        begin_reason=np.where(cut_before, reason, tracks.begin_reason),
+    )
+    return rest, int((cut_after | cut_before).sum())
