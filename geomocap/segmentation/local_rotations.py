@@ -1,0 +1,133 @@
+"""How the surface around each sample turns, and how differently two samples turn."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from geomocap.segmentation.rotations import nearest_rotation
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _local_moments(
+    positions: np.ndarray,
+    reference: np.ndarray,
+    weights: np.ndarray,
+    first: np.ndarray,
+    members: np.ndarray,
+    nearness: np.ndarray,
+) -> np.ndarray:
+    count, frames = weights.shape
+    moments = np.zeros((count, frames, 3, 3))
+    for i in numba.prange(count):
+        center = np.empty(3)
+        start = np.empty(3)
+        for t in range(frames):
+            total = 0.0
+            center[:] = 0.0
+            start[:] = 0.0
+            for q in range(first[i], first[i + 1]):
+                j = members[q]
+                w = nearness[q] * weights[j, t]
+                total += w
+                for c in range(3):
+                    center[c] += w * positions[j, t, c]
+                    start[c] += w * reference[j, c]
+            if total <= 0.0:
+                continue
+            for c in range(3):
+                center[c] /= total
+                start[c] /= total
+            for q in range(first[i], first[i + 1]):
+                j = members[q]
+                w = nearness[q] * weights[j, t] / total
+                for a in range(3):
+                    moved = w * (positions[j, t, a] - center[a])
+                    for b in range(3):
+                        moments[i, t, a, b] += moved * (reference[j, b] - start[b])
+    return moments
+
+
+def local_rotations(
+    positions: np.ndarray, reference: np.ndarray, weights: np.ndarray, geodesics: np.ndarray, radius: float
+) -> np.ndarray:
+    """Rotation of each sample's neighbourhood since the reference, by weighted Kabsch.
+
+    Weights fall with the distance along the surface as a Gaussian of 0.6 radii, so that limbs that touch do not mix.
+
+    Parameters
+    ----------
+    positions : (N, T, 3) float, metres
+        Complete.
+    reference : (N, 3) float, metres
+    weights : (N, T) float
+        Of the positions.
+    geodesics : (N, N) float, metres
+        Distances along the surface; infinite where farther than the radius.
+    radius : float, metres
+
+    Returns
+    -------
+    (N, T, 3, 3) float
+        world from reference.
+    """
+    near = geodesics <= radius
+    rows, members = np.nonzero(near)
+    first = np.concatenate([[0], np.cumsum(near.sum(axis=1))])
+    nearness = np.exp(-((geodesics[rows, members] / (0.6 * radius)) ** 2))
+    moments = _local_moments(
+        np.ascontiguousarray(positions), np.ascontiguousarray(reference), weights, first, members, nearness
+    )
+    # what flat or thin neighbourhoods leave open stays as it was in the reference
+    size = np.trace(moments, axis1=2, axis2=3)[..., None, None]
+    return nearest_rotation(moments + (1e-9 * np.abs(size) + 1e-15) * np.eye(3))
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _turn_distances(flat: np.ndarray, rank: int) -> np.ndarray:
+    count, frames = flat.shape[:2]
+    result = np.zeros((count, count), np.float32)
+    for i in numba.prange(count):
+        least = np.empty(rank, np.float32)
+        for j in range(i):
+            least[:] = 3.0
+            for t in range(frames):
+                trace = np.float32(0.0)
+                for c in range(9):
+                    trace += flat[i, t, c] * flat[j, t, c]
+                if trace < least[0]:  # least holds the smallest traces so far, largest of them first
+                    k = 0
+                    while k + 1 < rank and least[k + 1] > trace:
+                        least[k] = least[k + 1]
+                        k += 1
+                    least[k] = trace
+            cosine = min(max((least[0] - np.float32(1.0)) / np.float32(2.0), np.float32(-1.0)), np.float32(1.0))
+            result[i, j] = np.arccos(cosine)
+    for i in range(count):
+        for j in range(i):
+            result[j, i] = result[i, j]
+    return result
+
+
+def turn_distances(rotations: np.ndarray, share: float = 0.05, most_frames: int = 120) -> np.ndarray:
+    """Angle by which two samples turn differently, exceeded in a small share of the frames.
+
+    Parameters
+    ----------
+    rotations : (N, T, 3, 3) float
+        Since a common reference.
+    share : float
+        Share of the frames in which the angle is larger; 0.05: the 95th percentile.
+    most_frames : int
+        Longer sequences are looked at in so many frames, spread evenly.
+
+    Returns
+    -------
+    (N, N) float32, radians
+    """
+    count, frames = rotations.shape[:2]
+    if frames > most_frames:
+        rotations = rotations[:, np.linspace(0, frames - 1, most_frames).round().astype(int)]
+        frames = most_frames
+    flat = np.ascontiguousarray(rotations.reshape(count, frames, 9), np.float32)
+    return _turn_distances(flat, 1 + int(share * (frames - 1)))

@@ -1,0 +1,268 @@
+"""Rigid bodies found from motion paths: their number, samples, soft borders and motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+from scipy.sparse import csr_matrix
+
+from geomocap.errors import GeometryError
+from geomocap.progress import Progress, silent
+from geomocap.segmentation.body_elimination import Criterion, EliminationStep, eliminate
+from geomocap.segmentation.body_model import BodyModel, Evidence, carry, model_of_labels, reassign
+from geomocap.segmentation.connected_linkage import Linkage, connected_linkage
+from geomocap.segmentation.local_rotations import local_rotations, turn_distances
+from geomocap.segmentation.motion_paths import MotionPaths
+from geomocap.segmentation.surface_graph import SurfaceGraph, surface_graph
+from geomocap.segmentation.track_completion import complete_tracks
+from geomocap.settings import Settings
+
+_LEAST_SAMPLES = 20
+_STAGE = "bodies"
+
+
+class MotionBodiesSettings(Settings):
+    """How rigid bodies are found from motion paths."""
+
+    bodies: int = Field(default=0, ge=0, description="number of bodies; 0: found automatically")
+    min_turn_deg: float = Field(
+        default=15.0, gt=0, lt=180, description="a body turns at least this much against each neighbour (degrees)"
+    )
+    min_excess_deg: float = Field(
+        default=4.5,
+        gt=0,
+        lt=90,
+        description="blends of its neighbours must miss a body's core by at least this, seen from its middle (degrees)",
+    )
+    radius: float = Field(
+        default=0.03, gt=0, lt=0.5, description="surface around a sample that shows how it turns (share of the extent)"
+    )
+    first_cut_deg: float = Field(
+        default=12.0, gt=0, lt=180, description="groups of samples that turn less differently are the start (degrees)"
+    )
+    min_share: float = Field(default=0.008, ge=0, lt=0.5, description="smallest body (share of the samples)")
+    neighbours: int = Field(default=10, ge=4, description="neighbours of a sample on the surface")
+    max_stretch: float = Field(
+        default=2.0, gt=1, description="neighbours that separate more are none (times the usual distance)"
+    )
+    reach: float = Field(
+        default=0.08, gt=0, lt=1, description="a sample may belong to bodies this near along the surface (extents)"
+    )
+    blend_penalty: float = Field(
+        default=0.004, ge=0, description="an even blend of two bodies counts as a residual of this (extents)"
+    )
+    largest_residual: float = Field(default=0.03, gt=0, description="larger residuals count as this (extents)")
+    smoothness: float = Field(
+        default=0.3, ge=0, lt=1, description="weight of its neighbours in the choice of a sample's body (0..1)"
+    )
+
+
+@dataclass(frozen=True)
+class MotionBodies:
+    """B rigid bodies of N samples over T frames.
+
+    A body is a part of the surface that turns, somewhere in the sequence, at least `min_turn_deg` against each
+    neighbour, and whose core no blend of its neighbours explains.
+
+    Attributes
+    ----------
+    label : (N,) int32
+        Body of each sample; -1: none.
+    weights : (N, B) float
+        Skin weights: at soft borders a sample follows two bodies; rows sum to 1.
+    rotations : (T, B, 3, 3) float
+        Since frame 0, world axes.
+    translations : (T, B, 3) float, metres
+        position(t) = rotation @ position(0) + translation.
+    reliability : (T, B) float
+        Share of a body's samples that are seen in a frame and follow the body, 0 to 1.
+    rest : (N, 3) float, metres, world
+        Positions of the samples in frame 0.
+    positions : (N, T, 3) float, metres, world
+        Of the samples, gaps filled.
+    residuals : (N,) float, metres
+        Root mean square distance of a sample from where its bodies carry it.
+    lasting : (N, N) float32, metres
+        Lasting distance of each two samples, see `surface_graph.lasting_distances`.
+    adjacency : (N, N) csr_matrix
+        Neighbours on the surface.
+    curve : tuple of EliminationStep
+        Number of bodies as a function of how strict the criterion is.
+    linkage : Linkage
+        Tree of the first grouping, whose cuts are the alternatives.
+    extent : float, metres
+    """
+
+    label: np.ndarray
+    weights: np.ndarray
+    rotations: np.ndarray
+    translations: np.ndarray
+    reliability: np.ndarray
+    rest: np.ndarray
+    positions: np.ndarray
+    residuals: np.ndarray
+    lasting: np.ndarray
+    adjacency: csr_matrix
+    curve: tuple[EliminationStep, ...]
+    linkage: Linkage
+    extent: float
+
+    @property
+    def body_count(self) -> int:
+        """Number of bodies B."""
+        return self.rotations.shape[1]
+
+    @property
+    def centers(self) -> np.ndarray:
+        """Centres of the bodies, (T, B, 3), metres, world: mean of their samples at rest, carried."""
+        middle = np.stack([self.rest[self.label == b].mean(axis=0) for b in range(self.body_count)])
+        return np.einsum("tbij,bj->tbi", self.rotations, middle) + self.translations
+
+
+def find_motion_bodies(
+    paths: MotionPaths, settings: MotionBodiesSettings | None = None, progress: Progress = silent
+) -> MotionBodies:
+    """Find the rigid bodies that move the samples.
+
+    Every sample's neighbourhood on the surface has a rotation since frame 0, whatever lever arms there are. Samples
+    that turn alike are grouped (average linkage along the surface), too finely. Each group gets a rigid motion, each
+    sample follows one body or a blend of two, and then the weakest body goes, again and again, until each one left
+    turns against its neighbours and is not explained by blends of them.
+
+    Parameters
+    ----------
+    paths : MotionPaths
+    settings : MotionBodiesSettings, optional
+    progress : Progress, optional
+
+    Returns
+    -------
+    MotionBodies
+
+    Raises
+    ------
+    GeometryError
+        If there are too few samples.
+    """
+    settings = settings or MotionBodiesSettings()
+    if paths.count < _LEAST_SAMPLES:
+        raise GeometryError(f"motion paths: {paths.count} samples; at least {_LEAST_SAMPLES} are needed to find bodies")
+    extent = paths.extent
+    # Paths without gaps, the surface, and how it turns
+    positions, certainty = complete_tracks(paths)
+    weights = np.where(paths.seen, paths.weights(), 0.1 * certainty)
+    reference = positions[:, 0] if paths.reference is None else np.asarray(paths.reference, float)
+    graph = surface_graph(positions, reference, settings.neighbours, settings.max_stretch)
+    progress(_STAGE, 1, 4)
+    radius = max(settings.radius * extent, 2.5 * graph.spacing)
+    rotations = local_rotations(positions, reference, weights, graph.geodesics(radius), radius)
+    turns = turn_distances(_known_rotations(paths, rotations))
+    progress(_STAGE, 2, 4)
+    # Too many bodies
+    evidence = _evidence(positions, weights, reference, turns, graph, extent, settings)
+    linkage = connected_linkage(turns, graph.neighbours)
+    least = max(6, round(settings.min_share * paths.count))
+    label = absorb_small(linkage.cut(np.deg2rad(settings.first_cut_deg)), turns, graph, least)
+    if settings.bodies > int(label.max()) + 1:
+        label = linkage.cut_count(settings.bodies)
+    model = reassign(model_of_labels(label, evidence), evidence, 4).compact()
+    progress(_STAGE, 3, 4)
+    # Those that are there
+    criterion = Criterion(np.deg2rad(settings.min_turn_deg), np.deg2rad(settings.min_excess_deg), 0.05 * extent)
+    model, curve = eliminate(model, evidence, criterion, settings.bodies or None)
+    model = reassign(model, evidence, 3).compact()
+    progress(_STAGE, 4, 4)
+    return _result(model, evidence, paths, graph, curve, linkage, extent)
+
+
+def _known_rotations(paths: MotionPaths, fitted: np.ndarray) -> np.ndarray:
+    if paths.rotations is None:
+        return fitted
+    known = np.isfinite(paths.rotations).all(axis=(2, 3))
+    return np.where(known[..., None, None], paths.rotations, fitted)
+
+
+def _evidence(
+    positions: np.ndarray,
+    weights: np.ndarray,
+    rest: np.ndarray,
+    turns: np.ndarray,
+    graph: SurfaceGraph,
+    extent: float,
+    settings: MotionBodiesSettings,
+) -> Evidence:
+    near = csr_matrix(np.isfinite(graph.geodesics(max(settings.reach * extent, 3.0 * graph.spacing))).astype(float))
+    return Evidence(
+        positions,
+        weights,
+        rest,
+        turns,
+        graph.adjacency,
+        near,
+        settings.blend_penalty * extent,
+        settings.largest_residual * extent,
+        2e-4 * extent,
+        settings.smoothness,
+    )
+
+
+def absorb_small(label: np.ndarray, turns: np.ndarray, graph: SurfaceGraph, least: int) -> np.ndarray:
+    """Give groups of fewer samples to the neighbouring group that turns most alike, the smallest first."""
+    label = label.copy()
+    linked = graph.neighbours
+    while True:
+        groups, counts = np.unique(label, return_counts=True)
+        if counts.min() >= least or len(groups) == 1:
+            return np.unique(label, return_inverse=True)[1]
+        small = label == groups[np.argmin(counts)]
+        others = np.unique(label[linked[small].any(axis=0) & ~small])
+        if not len(others):
+            outside = np.flatnonzero(~small)
+            nearest = graph.lasting[np.ix_(small, outside)].min(axis=0).argmin()
+            others = label[outside[[nearest]]]
+        differences = [np.median(turns[np.ix_(small, label == g)]) for g in others]
+        label[small] = others[int(np.argmin(differences))]
+
+
+def _result(
+    model: BodyModel,
+    evidence: Evidence,
+    paths: MotionPaths,
+    graph: SurfaceGraph,
+    curve: list[EliminationStep],
+    linkage: Linkage,
+    extent: float,
+) -> MotionBodies:
+    memberships = model.memberships()
+    carried = np.zeros_like(evidence.positions)
+    for b in range(model.count):
+        some = np.flatnonzero(memberships[:, b] > 0)
+        moved = carry(model.rotations[b], model.translations[b], evidence.rest[some])
+        carried[some] += memberships[some, b][:, None, None] * moved
+    miss = np.linalg.norm(carried - evidence.positions, axis=2)
+    total = np.maximum(evidence.weights.sum(axis=1), 1e-12)
+    residuals = np.sqrt((evidence.weights * miss**2).sum(axis=1) / total)
+    follows = paths.seen & (miss < max(4.0 * float(np.median(residuals)), 0.005 * extent))
+    reliability = np.stack([follows[model.label == b].mean(axis=0) for b in range(model.count)], axis=1)
+    # motions counted from frame 0
+    first, start = model.rotations[:, 0], model.translations[:, 0]
+    rotations = np.einsum("btij,bkj->tbik", model.rotations, first)
+    translations = model.translations.swapaxes(0, 1) - np.einsum("tbij,bj->tbi", rotations, start)
+    rest = np.einsum("nb,nbi->ni", memberships, np.einsum("bij,nj->nbi", first, evidence.rest) + start)
+    return MotionBodies(
+        model.label.astype(np.int32),
+        memberships,
+        rotations,
+        translations,
+        reliability,
+        rest,
+        evidence.positions,
+        residuals,
+        graph.lasting,
+        graph.adjacency,
+        tuple(curve),
+        linkage,
+        extent,
+    )

@@ -1,0 +1,82 @@
+"""Motion paths: points of a surface followed through time, whatever followed them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geomocap.errors import GeometryError
+
+_LEAST_FRAMES = 2
+
+
+@dataclass(frozen=True)
+class MotionPaths:
+    """N samples of a surface over T frames: tracked nodes, patches, trajectories, ellipsoids or vertices.
+
+    Attributes
+    ----------
+    positions : (N, T, 3) float, metres, world
+        NaN where a sample was not followed.
+    rotations : (N, T, 3, 3) float, optional
+        Turn of each sample since the reference, world axes; NaN where not known. All samples of one rigid body have the
+        same: without a common reference for all of them, leave them out.
+    sigma : (N,) or (N, T) float, optional
+        Standard deviation of the positions, metres.
+    reference : (N, 3) float, optional
+        Positions of all samples at one time, metres, world. The motion is counted from there; without it, from frame 0
+        (samples that are not seen there are carried back by their neighbours).
+    """
+
+    positions: np.ndarray
+    rotations: np.ndarray | None = None
+    sigma: np.ndarray | None = None
+    reference: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        if self.positions.ndim != 3 or self.positions.shape[2] != 3:
+            raise GeometryError(f"motion paths: positions have shape {self.positions.shape}, expected (N, T, 3)")
+        count, frames = self.positions.shape[:2]
+        if frames < _LEAST_FRAMES:
+            raise GeometryError(f"motion paths: {frames} frames; at least {_LEAST_FRAMES} are needed to see motion")
+        optional = {
+            "rotations": (self.rotations, [(count, frames, 3, 3)]),
+            "sigma": (self.sigma, [(count,), (count, frames)]),
+            "reference": (self.reference, [(count, 3)]),
+        }
+        for name, (array, shapes) in optional.items():
+            if array is not None and array.shape not in shapes:
+                raise GeometryError(f"motion paths: {name} have shape {array.shape}, expected {shapes[-1]}")
+        if not np.isfinite(self.positions).all(axis=2).any(axis=1).all():
+            raise GeometryError("motion paths: a sample without any position; leave such samples out")
+
+    @property
+    def seen(self) -> np.ndarray:
+        """Where a sample has a position, (N, T) bool."""
+        return np.isfinite(self.positions).all(axis=2)
+
+    @property
+    def count(self) -> int:
+        """Number of samples N."""
+        return self.positions.shape[0]
+
+    @property
+    def frames(self) -> int:
+        """Number of frames T."""
+        return self.positions.shape[1]
+
+    @property
+    def extent(self) -> float:
+        """Diagonal of the box around the samples, metres: that of the fullest frame."""
+        fullest = int(np.argmax(self.seen.sum(axis=0)))
+        return float(np.linalg.norm(np.ptp(self.positions[self.seen[:, fullest], fullest], axis=0)))
+
+    def weights(self) -> np.ndarray:
+        """Weight of each position, (N, T) float: relative to the median variance, between 0 and 4; 0 where not seen."""
+        if self.sigma is None:
+            return self.seen.astype(float)
+        sigma = np.broadcast_to(self.sigma if self.sigma.ndim == 2 else self.sigma[:, None], self.seen.shape)
+        known = self.seen & np.isfinite(sigma) & (sigma > 0)
+        middle = float(np.median(sigma[known])) if known.any() else 1.0
+        return np.where(known, np.minimum((middle / np.where(known, sigma, 1.0)) ** 2, 4.0), self.seen * 0.25)

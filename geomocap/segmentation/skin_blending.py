@@ -1,0 +1,144 @@
+"""How samples follow one body or a blend of two: soft skin near a joint is no body of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+_BIG = 1e30
+
+
+@dataclass(frozen=True)
+class Blends:
+    """What each sample follows best.
+
+    Attributes
+    ----------
+    costs : (N, B) float, metres²
+        Least cost of explaining the sample with body b as the (main) one; infinite where not allowed.
+    partner : (N, B) int32
+        The second body of that explanation; -1: none, the body alone.
+    share : (N, B) float
+        Weight of the main body, 0.5 to 1.
+    """
+
+    costs: np.ndarray
+    partner: np.ndarray
+    share: np.ndarray
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _explain(
+    positions: np.ndarray,
+    weights: np.ndarray,
+    rest: np.ndarray,
+    rotations: np.ndarray,
+    translations: np.ndarray,
+    allowed: np.ndarray,
+    adjacent: np.ndarray,
+    penalty: float,
+    cap: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    count, frames = weights.shape
+    bodies = len(rotations)
+    costs = np.full((count, bodies), np.inf)
+    partner = np.full((count, bodies), -1, np.int32)
+    share = np.ones((count, bodies))
+    for i in numba.prange(count):
+        total = 1e-12
+        for t in range(frames):
+            total += weights[i, t]
+        miss = np.empty((bodies, frames, 3))  # observed minus carried by the body
+        for b in range(bodies):
+            if not allowed[i, b]:
+                continue
+            cost = 0.0
+            for t in range(frames):
+                square = 0.0
+                for c in range(3):
+                    carried = translations[b, t, c]
+                    for d in range(3):
+                        carried += rotations[b, t, c, d] * rest[i, d]
+                    miss[b, t, c] = positions[i, t, c] - carried
+                    square += miss[b, t, c] ** 2
+                cost += weights[i, t] * min(square, cap)
+            costs[i, b] = cost / total
+        for a in range(bodies):
+            if not allowed[i, a]:
+                continue
+            for b in range(a):
+                if not allowed[i, b] or not adjacent[a, b]:
+                    continue
+                # observed = w carried_a + (1 - w) carried_b: linear in w
+                above, below = 0.0, 1e-18
+                for t in range(frames):
+                    for c in range(3):
+                        difference = miss[b, t, c] - miss[a, t, c]
+                        above += weights[i, t] * miss[b, t, c] * difference
+                        below += weights[i, t] * difference * difference
+                # of w² below - 2 w above + constant + 4 w (1 - w) penalty: the least in [0, 1]
+                curve = below / total - 4.0 * penalty
+                if curve <= 1e-18:
+                    continue
+                w = (above / total - 2.0 * penalty) / curve
+                if w <= 0.0 or w >= 1.0:
+                    continue
+                cost = 0.0
+                for t in range(frames):
+                    square = 0.0
+                    for c in range(3):
+                        square += (w * miss[a, t, c] + (1.0 - w) * miss[b, t, c]) ** 2
+                    cost += weights[i, t] * min(square, cap)
+                cost = cost / total + 4.0 * w * (1.0 - w) * penalty
+                main, other, part = (a, b, w) if w >= 0.5 else (b, a, 1.0 - w)
+                if cost < costs[i, main]:
+                    costs[i, main] = cost
+                    partner[i, main] = other
+                    share[i, main] = part
+    return costs, partner, share
+
+
+def explain(
+    positions: np.ndarray,
+    weights: np.ndarray,
+    rest: np.ndarray,
+    rotations: np.ndarray,
+    translations: np.ndarray,
+    allowed: np.ndarray,
+    adjacent: np.ndarray,
+    penalty: float,
+    cap: float,
+) -> Blends:
+    """Explain each sample by one body, or by a linear blend of two adjacent ones (linear blend skinning).
+
+    The cost is the mean squared residual plus 4 w (1 - w) penalty² for a blend of weights w and 1 - w.
+
+    Parameters
+    ----------
+    positions, weights : (N, T, 3) float, metres; (N, T) float
+    rest : (N, 3) float, metres
+    rotations, translations : (B, T, 3, 3), (B, T, 3) float
+        Motions of the bodies since the reference.
+    allowed : (N, B) bool
+        Bodies that may explain a sample.
+    adjacent : (B, B) bool
+        Bodies that may blend; symmetric.
+    penalty : float, metres
+    cap : float, metres
+        Larger residuals of single frames count as this.
+    """
+    return Blends(
+        *_explain(
+            np.ascontiguousarray(positions),
+            weights,
+            rest,
+            np.ascontiguousarray(rotations),
+            np.ascontiguousarray(translations),
+            allowed,
+            adjacent,
+            penalty**2,
+            cap**2,
+        )
+    )

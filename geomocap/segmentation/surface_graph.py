@@ -1,0 +1,126 @@
+"""Which samples of a moving surface are neighbours: those that stay near each other all the time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+FRAMES_LOOKED_AT = 20
+_FAR = np.float32(1e9)
+
+
+@dataclass(frozen=True)
+class SurfaceGraph:
+    """Neighbourhood of N samples.
+
+    Attributes
+    ----------
+    adjacency : (N, N) csr_matrix of float, metres
+        Symmetric; distance in the reference, of samples that are neighbours on the surface.
+    lasting : (N, N) float32, metres
+        Lasting distance of each two samples: the third largest over the frames looked at (the largest of few frames).
+    spacing : float, metres
+        Median lasting distance of nearest neighbours.
+    """
+
+    adjacency: csr_matrix
+    lasting: np.ndarray
+    spacing: float
+
+    @property
+    def neighbours(self) -> np.ndarray:
+        """Which samples are neighbours, (N, N) bool."""
+        dense = np.zeros(self.adjacency.shape, bool)
+        dense[self.adjacency.nonzero()] = True
+        return dense
+
+    def geodesics(self, limit: float) -> np.ndarray:
+        """Distances along the surface, (N, N) float, metres; infinite beyond the limit."""
+        return dijkstra(self.adjacency, directed=False, limit=limit)
+
+
+def frames_looked_at(frames: int, most: int = FRAMES_LOOKED_AT) -> np.ndarray:
+    """Frames spread evenly over a sequence, first and last among them."""
+    return np.unique(np.linspace(0, frames - 1, min(frames, most)).round().astype(int))
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _lasting_distances(positions: np.ndarray, rank: int) -> np.ndarray:
+    count, frames = positions.shape[:2]
+    result = np.zeros((count, count), np.float32)
+    for i in numba.prange(count):
+        best = np.empty(rank)
+        for j in range(count):
+            if j == i:
+                continue
+            best[:] = 0.0
+            for t in range(frames):
+                x = positions[i, t, 0] - positions[j, t, 0]
+                y = positions[i, t, 1] - positions[j, t, 1]
+                z = positions[i, t, 2] - positions[j, t, 2]
+                square = x * x + y * y + z * z
+                if square > best[0]:  # best holds the largest so far, smallest of them first
+                    k = 0
+                    while k + 1 < rank and best[k + 1] < square:
+                        best[k] = best[k + 1]
+                        k += 1
+                    best[k] = square
+            result[i, j] = np.sqrt(best[0])
+    return result
+
+
+def lasting_distances(positions: np.ndarray) -> np.ndarray:
+    """Distance that two samples reach again and again: the third largest of those in up to 20 frames.
+
+    A hand that rests on a hip for a while is far from it at other times; that is how false contacts are told from
+    surface. The two largest distances are left to faults of the tracking.
+
+    Parameters
+    ----------
+    positions : (N, T, 3) float, metres
+        Complete.
+
+    Returns
+    -------
+    (N, N) float32, metres
+    """
+    looked_at = frames_looked_at(positions.shape[1])
+    rank = 3 if len(looked_at) >= 12 else 1
+    return _lasting_distances(np.ascontiguousarray(positions[:, looked_at], np.float64), rank)
+
+
+def surface_graph(positions: np.ndarray, reference: np.ndarray, neighbours: int, max_stretch: float) -> SurfaceGraph:
+    """Connect each sample with those nearest to it in lasting distance.
+
+    Parameters
+    ----------
+    positions : (N, T, 3) float, metres
+        Complete.
+    reference : (N, 3) float, metres
+    neighbours : int
+        Neighbours of a sample, before symmetry.
+    max_stretch : float
+        Pairs whose lasting distance is more than this many times both their samples' usual distance of neighbours are
+        no neighbours.
+    """
+    lasting = lasting_distances(positions)
+    count = len(lasting)
+    neighbours = min(neighbours, count - 1)
+    apart = lasting + np.diag(np.full(count, _FAR))
+    order = np.argpartition(apart, neighbours - 1, axis=1)[:, :neighbours]
+    near = np.sort(np.take_along_axis(apart, order, axis=1), axis=1)
+    usual = near[:, min(5, neighbours - 1)]
+    rows = np.repeat(np.arange(count), neighbours)
+    columns = order.ravel()
+    limit = max_stretch * np.minimum(usual[rows], usual[columns])
+    # the three nearest stay connected in any case
+    rank = np.argsort(np.argsort(np.take_along_axis(apart, order, axis=1), axis=1), axis=1).ravel()
+    keep = (apart[rows, columns] <= limit) | (rank < 3)
+    rows, columns = rows[keep], columns[keep]
+    lengths = np.linalg.norm(reference[rows] - reference[columns], axis=1) + 1e-9
+    one_way = csr_matrix((lengths, (rows, columns)), shape=(count, count))
+    return SurfaceGraph(one_way.maximum(one_way.T).tocsr(), lasting, float(np.median(near[:, 0])))
