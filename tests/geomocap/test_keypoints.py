@@ -1,0 +1,84 @@
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from geomocap.errors import GeometryError
+from geomocap.tracking.keypoints import follow_keypoints
+from tests.geomocap.made_trajectories import make_tracks, rigid_tracks
+
+SHIFT, TURN = np.array([0.01, -0.005, 0.002]), np.array([1.0, 2.0, 5.0])
+
+
+def cloud(count=200, seed=0, size=0.1):
+    return np.random.default_rng(seed).uniform(-size, size, (count, 3))
+
+
+def truth(center, frames, start=0):
+    out = []
+    for t in range(frames):
+        R = Rotation.from_rotvec(np.radians(TURN) * t).as_matrix()
+        R0 = Rotation.from_rotvec(np.radians(TURN) * start).as_matrix()
+        out.append(R @ R0.T @ (center - start * SHIFT) + t * SHIFT)
+    return np.array(out)
+
+
+def test_a_keypoint_moves_with_its_body():
+    tracks = rigid_tracks(cloud(), 15, SHIFT, TURN)
+    center = np.array([0.05, 0.02, -0.03])
+    paths = follow_keypoints(tracks, center[None], np.array([0.05]), 0)
+    assert_allclose(paths.positions[:, 0], truth(center, 15), atol=1e-4)
+    assert not paths.bridged.any() and (paths.n_tracks > 3).all()
+
+
+def test_placed_amid_the_sequence_it_is_followed_both_ways():
+    tracks = rigid_tracks(cloud(), 15, SHIFT, TURN)
+    center = truth(np.array([0.05, 0.02, -0.03]), 15)[6]
+    paths = follow_keypoints(tracks, center[None], np.array([0.05]), 6)
+    assert_allclose(paths.positions[:, 0], truth(center, 15, 6), atol=1e-4)
+
+
+def test_one_drifting_track_has_no_say():
+    tracks = rigid_tracks(cloud(), 15, SHIFT, TURN)
+    near = np.argsort(np.linalg.norm(tracks.positions[:, 0], axis=1))
+    positions = tracks.positions.copy()
+    positions[near[0]] += np.linspace(0, 0.08, 15)[:, None]
+    paths = follow_keypoints(make_tracks(positions), np.zeros((1, 3)), np.array([0.05]), 0)
+    assert np.linalg.norm(paths.positions[:, 0] - truth(np.zeros(3), 15), axis=1).max() < 0.002
+
+
+def test_gaps_are_bridged_by_the_body_and_marked():
+    tracks = rigid_tracks(cloud(), 15, SHIFT, TURN)
+    inside = np.linalg.norm(tracks.positions[:, 0], axis=1) < 0.05
+    positions = tracks.positions.copy()
+    positions[np.ix_(inside, np.arange(5, 9))] = np.nan
+    paths = follow_keypoints(make_tracks(positions), np.zeros((1, 3)), np.array([0.05]), 0)
+    assert_allclose(paths.positions[:, 0], truth(np.zeros(3), 15), atol=1e-4)
+    assert paths.bridged[:, 0].tolist() == [False] * 5 + [True] * 4 + [False] * 6
+
+
+def test_tracks_that_come_later_take_over():
+    tracks = rigid_tracks(cloud(), 15, SHIFT, TURN)
+    positions = tracks.positions.copy()
+    old = np.arange(200) < 100
+    positions[old, 8:] = np.nan
+    positions[~old, :5] = np.nan
+    paths = follow_keypoints(make_tracks(positions), np.zeros((1, 3)), np.array([0.05]), 0)
+    assert_allclose(paths.positions[:, 0], truth(np.zeros(3), 15), atol=1e-4)
+    assert not paths.bridged.any()
+
+
+def test_nothing_near_is_nan():
+    tracks = rigid_tracks(cloud(), 5, SHIFT, TURN)
+    paths = follow_keypoints(tracks, np.array([[3.0, 0, 0]]), np.array([0.05]), 0)
+    assert np.isnan(paths.positions[1:]).all() and (paths.n_tracks == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("radii", "frame", "message"),
+    [([0.05], 9, "frames 0 to 4"), ([0.0], 0, "radius above 0"), ([0.05, 0.05], 0, "1 key-points")],
+)
+def test_wrong_input_is_refused(radii, frame, message):
+    tracks = rigid_tracks(cloud(), 5, SHIFT, TURN)
+    with pytest.raises(GeometryError, match=message):
+        follow_keypoints(tracks, np.zeros((1, 3)), np.array(radii), frame)
