@@ -48,7 +48,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Significance:
-    """Test of a parameter that the final model does not have, or of one that it has.
+    """Test of a parameter that the final model does not have.
 
     Attributes
     ----------
@@ -321,7 +321,8 @@ def choose_model(estimate: Estimate, prior: Prior, settings: BarSettings) -> tup
         # Each camera's k3 must earn its place against the number of observations (Schwarz's criterion)
         if gain > len(names) * np.log(2 * len(adjusted.network.bar)) and adjusted.sigma0 > 1.02 * with_k3.sigma0:
             adjusted = with_k3
-    return adjusted, tests
+    in_model = {INTERIOR_NAMES[p] for p in adjusted.columns.free_interior}
+    return adjusted, tuple(t for t in tests if t.parameter not in in_model)
 
 
 def tests_of(adjusted: Adjusted, parameters: tuple[int, ...]) -> tuple[Significance, ...]:
