@@ -1,6 +1,6 @@
 """Surface measurement: the images of one frame become a point cloud."""
 
-from geomocap.cloud.frame import CloudFrame, TemplateCloud, cloud_of_frame
+from geomocap.cloud.frame import CloudFrame, TemplateCloud, cloud_of_frame, undistorted_color
 from geomocap.cloud.groups import MatchGroup, MatchGroups, match_groups
 from geomocap.cloud.points import MeasuredPoints
 from geomocap.cloud.settings import CloudSettings
@@ -14,4 +14,5 @@ __all__ = [
     "TemplateCloud",
     "cloud_of_frame",
     "match_groups",
+    "undistorted_color",
 ]

@@ -92,6 +92,12 @@ class PreparedImages:
     stack: ImageStack
 
 
+def undistorted_color(image: np.ndarray, groups: MatchGroups, camera: int) -> np.ndarray:
+    """Return the colours (H, W, 3) of one camera's image as the matching sees them, without distortion."""
+    maps = groups.maps[camera]
+    return image if maps is None else cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR)
+
+
 def prepare(
     images: Sequence[np.ndarray], masks: Sequence[np.ndarray] | None, groups: MatchGroups, settings: CloudSettings
 ) -> PreparedImages:
@@ -125,7 +131,7 @@ def prepare(
             grey = ImageStack.of([grey], settings.kernel.order).sample(0, pixels).reshape(x.shape)
             outside = ~np.isfinite(grey)
             grey = np.where(outside, np.float32(0), grey)
-            color = cv2.remap(color, x, y, cv2.INTER_LINEAR)
+            color = undistorted_color(color, groups, c)
             if mask is not None:
                 mask = cv2.remap(mask.astype(np.uint8), x, y, cv2.INTER_NEAREST) != 0
             mask = ~outside if mask is None else mask & ~outside
