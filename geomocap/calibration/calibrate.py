@@ -12,24 +12,10 @@ import pycolmap
 
 from geomocap.calibration.adjustment import Adjusted
 from geomocap.calibration.covariance import Covariance, covariance
-from geomocap.calibration.datum import (
-    Datum,
-    datum_from_cameras,
-    datum_from_floor,
-    datum_from_gravity,
-    datum_from_l_shape,
-    datum_from_points,
-    datum_from_rig,
-    interiors_of,
-)
-from geomocap.calibration.estimation import (
-    Estimate,
-    Significance,
-    choose_model,
-    estimate,
-    prior_for,
-)
+from geomocap.calibration.datum import Datum, interiors_of
+from geomocap.calibration.estimation import Estimate, estimate
 from geomocap.calibration.initial import start, two_candidates
+from geomocap.calibration.lens_model import Significance, choose_model, prior_for
 from geomocap.calibration.quality import (
     CameraPrecision,
     Coverage,
@@ -45,58 +31,13 @@ from geomocap.calibration.settings import BarSettings
 from geomocap.calibration.sightings import Sightings
 from geomocap.calibration.stability import Moved, moved_of
 from geomocap.calibration.verdict import Verdict, judge
+from geomocap.calibration.world import World
 from geomocap.cameras import Rig
 from geomocap.errors import CalibrationError, RunError
 from geomocap.progress import Progress, silent
 
 MARK = "calibration.json"
 """File beside a model that says that it is ours and may be replaced."""
-
-
-@dataclass(frozen=True)
-class World:
-    """What is known of the world's frame; the first of these that is given counts.
-
-    Attributes
-    ----------
-    rig : Rig, optional
-        An existing calibration to align with.
-    points_pixels, points_world : (C, N, 2) and (N, 3) float, optional
-        Points with known coordinates, COLMAP pixels (NaN where not seen) and metres.
-    l_shape : (C, 3, 2) float, optional
-        The three targets of an L-shaped reference in each camera, in any order, with `arms`.
-    arms : (float, float)
-        Long and short arm of it, metres.
-    floor : tuple of int
-        Frames in which the bar lies on the floor.
-    gravity : (camera, (x, y, z)), optional
-        Downwards in a camera's axes.
-    up : {"x", "y", "z"}
-    """
-
-    rig: Rig | None = None
-    points_pixels: np.ndarray | None = None
-    points_world: np.ndarray | None = None
-    l_shape: np.ndarray | None = None
-    arms: tuple[float, float] = (0.0, 0.0)
-    floor: tuple[int, ...] = ()
-    gravity: tuple[str, tuple[float, float, float]] | None = None
-    up: str = "z"
-
-    def datum(self, adjusted: Adjusted, target_radius: float) -> Datum:
-        """Find the world of an adjusted network."""
-        network = adjusted.network
-        if self.rig is not None:
-            return datum_from_rig(network, self.rig)
-        if self.points_pixels is not None and self.points_world is not None:
-            return datum_from_points(network, self.points_pixels, self.points_world)
-        if self.l_shape is not None:
-            return datum_from_l_shape(network, self.l_shape, *self.arms, self.up)
-        if self.floor:
-            return datum_from_floor(network, self.floor, self.up, target_radius)
-        if self.gravity is not None:
-            return datum_from_gravity(network, self.gravity[0], np.array(self.gravity[1]), self.up)
-        return datum_from_cameras(network, self.up)
 
 
 @dataclass(frozen=True)
@@ -295,7 +236,7 @@ def calibrate_bar(
     try:
         begin = start(sightings, length, settings, interior)
         progress("calibrate", 1, steps)
-        prior, free = prior_for(sightings, begin, interior, settings)
+        prior, free = prior_for(sightings.sizes, begin, interior, settings)
         found = estimate(sightings, begin, length, settings, prior, free, length_sigma, target_radius)
         progress("calibrate", 2, steps)
     except CalibrationError as error:
@@ -303,7 +244,7 @@ def calibrate_bar(
         if not faults:
             raise
         raise CalibrationError(f"{error} ({'; '.join(faults)})") from None
-    adjusted, tests = choose_model(found, prior, settings)
+    adjusted, tests = choose_model(found.adjusted, prior, settings)
     progress("calibrate", 3, steps)
     datum = world.datum(adjusted, found.target_radius)
     adjusted = replace(adjusted, network=datum.apply(adjusted.network))

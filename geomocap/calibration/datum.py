@@ -12,8 +12,8 @@ from itertools import permutations
 
 import numpy as np
 
-from geomocap.calibration.initial import ideal_coordinates, triangulate
 from geomocap.calibration.network import Network
+from geomocap.calibration.orientation import ideal_coordinates, triangulate
 from geomocap.calibration.projection import interior_of
 from geomocap.cameras import Rig
 from geomocap.errors import CalibrationError

@@ -1,4 +1,4 @@
-"""From approximate values to the final adjustment: labels, outliers, the camera model that the observations carry."""
+"""From approximate values to the final adjustment: labels, cameras that moved, outliers."""
 
 from __future__ import annotations
 
@@ -6,13 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geomocap.calibration.adjustment import OPENCV, Adjusted, Prior, adjust, interior_indices
-from geomocap.calibration.covariance import covariance
+from geomocap.calibration.adjustment import Adjusted, Prior, adjust
 from geomocap.calibration.eccentricity import ball_radius, observed_radii, shifts
-from geomocap.calibration.initial import network_of, weak_prior
+from geomocap.calibration.initial import network_of
 from geomocap.calibration.labelling import identify, observed
 from geomocap.calibration.network import Network
-from geomocap.calibration.projection import INTERIOR_NAMES
 from geomocap.calibration.settings import BarSettings
 from geomocap.calibration.sightings import Sightings
 from geomocap.calibration.stability import refined_changes, resect, split_view, sudden_loss, sudden_shift, test_split
@@ -44,27 +42,6 @@ class Estimate:
     view_of: np.ndarray
     target_radius: float
     sigma_factor: float
-
-
-@dataclass(frozen=True)
-class Significance:
-    """Test of a parameter that the final model does not have.
-
-    Attributes
-    ----------
-    camera, parameter : str
-    value, sigma : float
-    """
-
-    camera: str
-    parameter: str
-    value: float
-    sigma: float
-
-    @property
-    def significant(self) -> bool:
-        """Whether it differs from zero by more than 3.3 standard deviations (0.1 % of chance)."""
-        return abs(self.value) > 3.3 * self.sigma
 
 
 def poses_of(network: Network) -> np.ndarray:
@@ -299,54 +276,3 @@ def _outliers(adjusted: Adjusted, threshold: float) -> np.ndarray:
 
 def _times(network: Network, sightings: Sightings) -> np.ndarray:
     return np.searchsorted(sightings.frames, network.frames)[network.bar]
-
-
-def choose_model(estimate: Estimate, prior: Prior, settings: BarSettings) -> tuple[Adjusted, tuple[Significance, ...]]:
-    """Test the parameters beyond OPENCV, and take k3 into the model if the observations ask for it.
-
-    Shear (and k3 where it is not part of the model) is estimated in an extra adjustment and tested against its standard
-    deviation; COLMAP's models have no shear, so it is reported only.
-    """
-    adjusted = estimate.adjusted
-    free = adjusted.columns.free_interior
-    if not free:
-        return adjusted, ()
-    names = adjusted.network.names
-    extra = interior_indices(("k3", "shear")) if settings.model != "FULL_OPENCV" else interior_indices(("shear",))
-    wide = adjust(adjusted.network, tuple(sorted({*free, *extra})), prior, adjusted.loss)
-    tests = tests_of(wide, extra)
-    if settings.model == "auto":
-        with_k3 = adjust(adjusted.network, (*free, *interior_indices(("k3",))), prior, adjusted.loss)
-        gain = (adjusted.cost - with_k3.cost) / with_k3.sigma0**2
-        # Each camera's k3 must earn its place against the number of observations (Schwarz's criterion)
-        if gain > len(names) * np.log(2 * len(adjusted.network.bar)) and adjusted.sigma0 > 1.02 * with_k3.sigma0:
-            adjusted = with_k3
-    in_model = {INTERIOR_NAMES[p] for p in adjusted.columns.free_interior}
-    return adjusted, tuple(t for t in tests if t.parameter not in in_model)
-
-
-def tests_of(adjusted: Adjusted, parameters: tuple[int, ...]) -> tuple[Significance, ...]:
-    """Return value and standard deviation of these interior parameters of every camera."""
-    C = covariance(adjusted).cameras
-    columns = adjusted.columns
-    out = []
-    for p in parameters:
-        k = columns.free_interior.index(p)
-        for c, name in enumerate(adjusted.network.names):
-            column = columns.interior(c)[k]
-            value = float(adjusted.network.interior[c, p])
-            out.append(Significance(name, INTERIOR_NAMES[p], value, float(np.sqrt(C[column, column]))))
-    return tuple(out)
-
-
-def prior_for(
-    sightings: Sightings, begin: Adjusted, given: np.ndarray | None, settings: BarSettings
-) -> tuple[Prior, tuple[int, ...]]:
-    """Prior and free parameters of the final model."""
-    if given is not None:
-        return Prior.none(len(sightings.cameras)), ()
-    prior = weak_prior(sightings.sizes, begin.network.interior[:, 0], settings)
-    free = OPENCV
-    if settings.model == "FULL_OPENCV":
-        free = interior_indices(INTERIOR_NAMES[:12])
-    return prior, free

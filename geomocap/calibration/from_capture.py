@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, ValidationError
 
-from geomocap.calibration.calibrate import Calibration, World, calibrate_bar
+from geomocap.calibration.calibrate import Calibration, calibrate_bar
 from geomocap.calibration.observations import Observed
 from geomocap.calibration.recording import Recording, measure
 from geomocap.calibration.settings import BarSettings
 from geomocap.calibration.targets import find_targets, gray_of
+from geomocap.calibration.world import World
 from geomocap.cameras import Rig
 from geomocap.capture import IMAGE_ENDINGS, read_capture_info, read_image
 from geomocap.errors import CalibrationError, CaptureError

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from geomocap.calibration.initial import ideal_coordinates
+from geomocap.calibration.orientation import ideal_coordinates
 from geomocap.calibration.projection import project_point
 from geomocap.calibration.sightings import Sightings
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomocap.calibration.adjustment import Adjusted, adjust
-from geomocap.calibration.initial import ideal_coordinates
 from geomocap.calibration.network import Network
+from geomocap.calibration.orientation import ideal_coordinates
 from geomocap.calibration.projection import INTERIOR_NAMES
 from geomocap.errors import CalibrationError
 

@@ -10,8 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geomocap.calibration.adjustment import Adjusted, Prior, adjust
-from geomocap.calibration.initial import ideal_coordinates, in_front
+from geomocap.calibration.initial import in_front
 from geomocap.calibration.network import Network
+from geomocap.calibration.orientation import ideal_coordinates
 from geomocap.calibration.projection import project_point
 from geomocap.calibration.sightings import Sightings
 

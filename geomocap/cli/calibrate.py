@@ -10,11 +10,12 @@ import numpy as np
 import typer
 
 from data_tools.calibration_files import read_calibration
-from geomocap.calibration.calibrate import Calibration, World, calibrate_bar, check_replaceable
+from geomocap.calibration.calibrate import Calibration, calibrate_bar, check_replaceable
 from geomocap.calibration.from_capture import calibrate_capture, up_of, with_l_shape, with_points
 from geomocap.calibration.observations import read_observed, sightings_of
 from geomocap.calibration.recording import Recording
 from geomocap.calibration.settings import BarSettings
+from geomocap.calibration.world import World
 from geomocap.capture import Capture, read_capture_info
 from geomocap.cli.execution import Workers, executor_for
 from geomocap.cli.jobs import CaptureFolder

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from geomocap.calibration import datum as d
-from geomocap.calibration.calibrate import World
 from geomocap.calibration.from_capture import with_points
 from geomocap.calibration.network import Network, rotated
 from geomocap.calibration.observations import read_observed
+from geomocap.calibration.world import World
 from geomocap.cameras import Rig
 from geomocap.errors import CalibrationError
 from tests.geomocap.bar_scenes import eight_cameras, true_network

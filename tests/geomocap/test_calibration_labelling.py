@@ -9,8 +9,8 @@ from scipy.optimize import least_squares
 
 from geomocap.calibration.disc import blurred_disc, fit_disc
 from geomocap.calibration.eccentricity import shifts
-from geomocap.calibration.initial import ideal_coordinates, relative_orientation, triangulate
 from geomocap.calibration.labelling import identify_frame
+from geomocap.calibration.orientation import ideal_coordinates, relative_orientation, triangulate
 from geomocap.calibration.pairs import eight_point, score_pairings
 from geomocap.calibration.projection import interior_of
 from geomocap.calibration.settings import BarSettings
