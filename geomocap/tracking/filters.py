@@ -18,7 +18,9 @@ from geomocap.settings import Settings
 from geomocap.tracking.smoothing import Motion
 from geomocap.tracking.trajectories import REASONS, TOO_FAST, TOO_JERKY, TOO_SHORT, UNLIKE, Trajectories
 
-_QUANTILE = 0.995
+_MOVING = 0.995  # share of all points whose speed and acceleration are certainly true
+_UNIFORM = 0.95  # share that certainly moves like the surface around it
+_LEAST_UNLIKE = 1e-6  # m; rounding isn't motion
 _NEIGHBOURS = 8
 _AGREEING = 3
 
@@ -31,10 +33,12 @@ class FilterSettings(Settings):
         None, gt=0, description="Highest acceleration (m/s²); from the data if not given"
     )
     beyond_data: float = Field(
-        2.0, gt=1, description="Limits from the data: so many times what 99.5 % of the points don't exceed"
+        2.5, gt=1, description="Limits from the data: so many times what all but a few points don't exceed"
     )
     window: int = Field(4, ge=1, description="Frames over which the motion is compared with that around it")
-    unlike: float = Field(0.015, gt=0, description="Largest distance from where the motion around it leads (m)")
+    unlike: float | None = Field(
+        None, gt=0, description="Largest distance from where the motion around it leads (m); from the data if not given"
+    )
     least_frames: int = Field(3, ge=1, description="Frames that a trajectory needs")
 
 
@@ -50,8 +54,8 @@ class Filtered:
         Row of each in the unfiltered trajectories.
     cut : dict
         For each reason, how many trajectories it cut or removed.
-    fastest, acceleration : float
-        Limits that were used, m/s and m/s².
+    fastest, acceleration, unlike : float
+        Limits that were used: m/s, m/s² and m.
     """
 
     trajectories: Trajectories
@@ -59,6 +63,7 @@ class Filtered:
     cut: dict[str, int]
     fastest: float
     acceleration: float
+    unlike: float
 
 
 def filter_trajectories(tracks: Trajectories, motion: Motion, settings: FilterSettings | None = None) -> Filtered:
@@ -74,13 +79,15 @@ def filter_trajectories(tracks: Trajectories, motion: Motion, settings: FilterSe
     settings = settings or FilterSettings()
     speed = np.linalg.norm(motion.velocities, axis=2)
     change = np.linalg.norm(motion.accelerations, axis=2)
-    fastest = settings.fastest or _limit(speed, settings.beyond_data)
-    acceleration = settings.acceleration or _limit(change, settings.beyond_data)
+    fastest = settings.fastest or _limit(speed, _MOVING, settings.beyond_data)
+    acceleration = settings.acceleration or _limit(change, _MOVING, settings.beyond_data)
+    away = departure(tracks, settings.window)
+    unlike = settings.unlike or max(_limit(away, _UNIFORM, settings.beyond_data), _LEAST_UNLIKE)
     with np.errstate(invalid="ignore"):
         tests = (
             (TOO_FAST, speed > fastest),
             (TOO_JERKY, change > acceleration),
-            (UNLIKE, departure(tracks, settings.window) > settings.unlike),
+            (UNLIKE, away > unlike),
         )
     cut = {}
     for reason, bad in tests:
@@ -88,7 +95,7 @@ def filter_trajectories(tracks: Trajectories, motion: Motion, settings: FilterSe
         cut[REASONS[reason]] = count
     kept = np.flatnonzero(tracks.lengths >= settings.least_frames)
     cut[REASONS[TOO_SHORT]] = len(tracks) - len(kept)
-    return Filtered(tracks.select(kept), kept, cut, fastest, acceleration)
+    return Filtered(tracks.select(kept), kept, cut, fastest, acceleration, unlike)
 
 
 def departure(tracks: Trajectories, window: int) -> np.ndarray:
@@ -127,9 +134,9 @@ def departure(tracks: Trajectories, window: int) -> np.ndarray:
     return out
 
 
-def _limit(values: np.ndarray, factor: float) -> float:
+def _limit(values: np.ndarray, share: float, factor: float) -> float:
     known = values[np.isfinite(values)]
-    return factor * float(np.quantile(known, _QUANTILE)) if len(known) else float("inf")
+    return factor * float(np.quantile(known, share)) if len(known) else float("inf")
 
 
 def _truncate(tracks: Trajectories, bad: np.ndarray, reason: int) -> tuple[Trajectories, int]:

@@ -166,7 +166,7 @@ def take_templates(X, Q, shape, want, levels, masks, P, templates, usable):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _prepare(A, center, shape, template, usable, mask, use_mask, samples, J, T, moments):
+def _prepare(A, center, shape, template, usable, mask, use_mask, with_slopes, samples, J, T, moments):
     """Choose the samples of one camera and form their Jacobian, free of offset and gain.
 
     Returns the number of samples; 0 if too few are seen. `moments`: variance of the template.
@@ -194,17 +194,20 @@ def _prepare(A, center, shape, template, usable, mask, use_mask, samples, J, T, 
             continue
         if use_mask and mask[int(y + 0.5), int(x + 0.5)] == 0:
             continue
-        ts, tt = template[q, 1], template[q, 2]
-        g2 = (ts * d0 + tt * d1) / facing
-        g0, g1 = ts - zs * g2, tt - zt * g2
         samples[count] = q
         T[count] = template[q, 0]
         mean_t += template[q, 0]
-        J[count, 0], J[count, 1], J[count, 2] = g0, g1, g2
-        J[count, 3], J[count, 4], J[count, 5] = t * g2 - z * g1, z * g0 - s * g2, s * g1 - t * g0
-        for r in range(6):
-            mean_j[r] += J[count, r]
         count += 1
+        if not with_slopes:
+            continue
+        ts, tt = template[q, 1], template[q, 2]
+        g2 = (ts * d0 + tt * d1) / facing
+        g0, g1 = ts - zs * g2, tt - zt * g2
+        i = count - 1
+        J[i, 0], J[i, 1], J[i, 2] = g0, g1, g2
+        J[i, 3], J[i, 4], J[i, 5] = t * g2 - z * g1, z * g0 - s * g2, s * g1 - t * g0
+        for r in range(6):
+            mean_j[r] += J[i, r]
     if count < LEAST_SAMPLES * offered or count < 12:
         return 0
     mean_t /= count
@@ -215,21 +218,23 @@ def _prepare(A, center, shape, template, usable, mask, use_mask, samples, J, T, 
     for i in range(count):
         T[i] -= mean_t
         variance += T[i] * T[i]
-        for r in range(6):
-            J[i, r] -= mean_j[r]
-            along[r] += J[i, r] * T[i]
+        if with_slopes:
+            for r in range(6):
+                J[i, r] -= mean_j[r]
+                along[r] += J[i, r] * T[i]
     if variance < _LEAST_VARIANCE * count:
         return 0
-    for i in range(count):
-        for r in range(6):
-            J[i, r] -= T[i] * along[r] / variance
+    if with_slopes:
+        for i in range(count):
+            for r in range(6):
+                J[i, r] -= T[i] * along[r] / variance
     moments[0] = variance / count
     return count
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _compare(A, shape, image, samples, count, J, T, b):
-    """Sample the image: right side Σ J̃ I into `b`; returns mean square, covariance with T, and variance of I."""
+def _compare(A, shape, image, samples, count, with_slopes, J, T, b):
+    """Sample the image: right side Σ J̃ I into `b`; returns its covariance with T and its variance."""
     H, W = image.shape
     total, square, product = 0.0, 0.0, 0.0
     b0 = b1 = b2 = b3 = b4 = b5 = 0.0
@@ -245,6 +250,8 @@ def _compare(A, shape, image, samples, count, J, T, b):
         total += value
         square += value * value
         product += value * T[i]
+        if not with_slopes:
+            continue
         b0 += J[i, 0] * value
         b1 += J[i, 1] * value
         b2 += J[i, 2] * value
@@ -320,7 +327,7 @@ def align_patches(
     for a in prange(len(which)):
         n = which[a]
         A = np.empty((C, 3, 4))
-        J = np.empty((C, M, 6), np.float32)
+        J = np.zeros((C, M, 6), np.float32)
         T = np.empty((C, M), np.float32)
         samples = np.empty((C, M), np.int64)
         counts = np.zeros(C, np.int64)
@@ -352,6 +359,7 @@ def align_patches(
                 usable[n, c],
                 masks[c],
                 use_mask,
+                iterations > 0,
                 samples[c],
                 J[c],
                 T[c],
@@ -378,7 +386,9 @@ def align_patches(
                     continue
                 if step > 0:
                     _local_camera(P[c], x_n, q_n, A[c])
-                product, variance = _compare(A[c], shape[n], images[c], samples[c], counts[c], J[c], T[c], b[c])
+                product, variance = _compare(
+                    A[c], shape[n], images[c], samples[c], counts[c], iterations > 0, J[c], T[c], b[c]
+                )
                 now[c] = product / math.sqrt(max(variance, 1e-3) * variance_t[c])
                 gains[c] = min(max(product / max(variance, 1e-3), 1 / _GAIN), _GAIN)
                 residual = max(variance_t[c] * (1 - now[c] * abs(now[c])), 0.0)

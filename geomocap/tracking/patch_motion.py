@@ -62,11 +62,13 @@ def lift_flow(view: FrameViews, positions: np.ndarray, flow: np.ndarray, neighbo
     slope, value = np.where(known[..., None, None], slope, 0.0), np.where(known[..., None], flow, 0.0)
     weight = known.astype(float)
     shift = np.zeros_like(positions)
+    flat = slope.reshape(len(slope), -1, 3)
     for _ in range(4):
-        N = np.einsum("nc,ncki,nckj->nij", weight, slope, slope) + np.eye(3) / _WEAK**2
-        b = np.einsum("nc,ncki,nck->ni", weight, slope, value)
-        shift = np.linalg.solve(N, b[:, :, None])[:, :, 0]
-        residual = np.linalg.norm(value - np.einsum("ncki,ni->nck", slope, shift), axis=2)
+        weighted = flat * np.repeat(weight, 2, axis=1)[:, :, None]
+        N = np.swapaxes(weighted, 1, 2) @ flat + np.eye(3) / _WEAK**2
+        b = np.swapaxes(weighted, 1, 2) @ value.reshape(len(value), -1, 1)
+        shift = np.linalg.solve(N, b)[:, :, 0]
+        residual = np.linalg.norm(value - (flat @ shift[:, :, None]).reshape(value.shape), axis=2)
         weight = known / (1 + (residual / _FLOW_SIGMA) ** 2)
     enough = np.flatnonzero(known.sum(axis=1) >= 2)
     if len(enough) < neighbours:

@@ -156,7 +156,7 @@ def facings(positions: np.ndarray, normals: np.ndarray, view: FrameViews) -> np.
 
 
 def with_templates(patches: Patches, want: np.ndarray, view: FrameViews) -> Patches:
-    """Take templates in the cameras `want` (N, C) bool; patches that a camera sees too little of stay without."""
+    """Take templates in the cameras `want` (N, C) bool that have none; where too little is seen there is none."""
     took = np.ascontiguousarray(want, np.uint8)
     templates, usable = patches.templates.copy(), patches.usable.copy()
     take_templates(
@@ -177,8 +177,8 @@ def with_templates(patches: Patches, want: np.ndarray, view: FrameViews) -> Patc
         patches.frames,
         patches.shape,
         patches.size,
-        np.where(got[:, :, None, None, None], templates, patches.templates),
-        np.where(got[:, :, None], usable, patches.usable),
+        templates,
+        usable,
         patches.has | got,
         np.where(got, hidden, patches.hidden),
     )

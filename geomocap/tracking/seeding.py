@@ -12,6 +12,7 @@ from geomocap.tracking.tracking_settings import TrackingSettings
 _FIT_VOXELS = 4.5  # radius of the piece of surface that gives a patch its shape, voxels
 _FACING = 0.35
 _HULL_SLACK = 3.0  # voxels that a seed may lie behind the drawn surface
+_REGULAR = 1e-12
 _ROUNDS = 3
 _PACKING = 0.7  # points placed at random at least r apart, as many as fit: 0.7 a square of r
 _SWEEP_PX = 1.0  # step of the search along the viewing ray, pixels
@@ -60,26 +61,28 @@ def surface_frames(view: FrameViews, points: np.ndarray) -> tuple[np.ndarray, np
     """
     tree = cKDTree(view.surface)
     radius = _FIT_VOXELS * view.voxel_size
-    outward = _outward(view, points, tree)
-    positions, frames, curvature = np.array(points, float), np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
-    for n, found in enumerate(tree.query_ball_point(points, radius, return_sorted=True)):
-        away = view.surface[found] - points[n]
-        _, axes = np.linalg.eigh(away.T @ away - len(away) * np.outer(away.mean(0), away.mean(0)))
-        normal = axes[:, 0] * (1.0 if axes[:, 0] @ outward[n] >= 0 else -1.0)
-        for _ in range(2):
-            frame = _frame_of(normal)
-            s, t, z = (away @ frame).T
-            near = np.abs(z) < 0.6 * radius  # not the other side of a thin limb
-            design = np.stack([np.ones_like(s), s, t, s * s, s * t, t * t], axis=1)
-            ridge = np.diag([0, 0, 0, 1, 1, 1]) * (0.05 * radius**4 * near.sum())
-            weighted = design * near[:, None]
-            fit = np.linalg.solve(weighted.T @ design + ridge + 1e-12 * np.eye(6), weighted.T @ z)
-            normal = frame @ np.array([-fit[1], -fit[2], 1.0])
-            normal /= np.linalg.norm(normal)
-        positions[n] += fit[0] * frame[:, 2]
-        frames[n] = frame
-        curvature[n] = np.clip(fit[3:], -0.25 / radius, 0.25 / radius)
-    return positions, frames, curvature
+    count = min(round(np.pi * _FIT_VOXELS**2), len(view.surface))
+    distance, near = tree.query(points, count)
+    away = view.surface[near] - points[:, None]
+    inside = (distance <= radius)[:, :, None]
+    middle = (away * inside).sum(axis=1) / inside.sum(axis=1)
+    spread_out = (away - middle[:, None]) * inside
+    normals = np.linalg.eigh(np.swapaxes(spread_out, 1, 2) @ spread_out)[1][:, :, 0]
+    outward = _outward(view, points)
+    normals *= np.where(np.einsum("ni,ni->n", normals, outward) >= 0, 1.0, -1.0)[:, None]
+    ridge = np.diag([0.0, 0, 0, 1, 1, 1]) * 0.05 * radius**4
+    for _ in range(2):
+        frames = _frames_of(normals)
+        s, t, z = np.moveaxis(away @ frames, 2, 0)
+        used = inside[:, :, 0] & (np.abs(z) < 0.6 * radius)  # not the other side of a thin limb
+        design = np.stack([np.ones_like(s), s, t, s * s, s * t, t * t], axis=2)
+        weighted = np.swapaxes(design * used[:, :, None], 1, 2)
+        regular = ridge * used.sum(axis=1)[:, None, None] + _REGULAR * np.eye(6)
+        fit = np.linalg.solve(weighted @ design + regular, weighted @ z[:, :, None])[:, :, 0]
+        slopes = np.stack([-fit[:, 1], -fit[:, 2], np.ones(len(fit))], axis=1)
+        normals = np.einsum("nij,nj->ni", frames, slopes / np.linalg.norm(slopes, axis=1, keepdims=True))
+    positions = points + fit[:, :1] * frames[:, :, 2]
+    return positions, frames, np.clip(fit[:, 3:], -0.25 / radius, 0.25 / radius)
 
 
 def patch_shape(curvature: np.ndarray, size: np.ndarray, radius_px: int) -> np.ndarray:
@@ -212,18 +215,19 @@ def _seen(view: FrameViews, points: np.ndarray) -> np.ndarray:
     return depth - view.surface_depth(points) < _HULL_SLACK * view.voxel_size
 
 
-def _outward(view: FrameViews, points: np.ndarray, tree: cKDTree) -> np.ndarray:
-    """Directions from which points are seen, (N, 3) float, unit: mean over their cameras, then over neighbours."""
+def _outward(view: FrameViews, points: np.ndarray) -> np.ndarray:
+    """Sum of the directions in which cameras that see points lie: (N, 3) float."""
     ray = view.centers[None] - points[:, None]
     ray /= np.linalg.norm(ray, axis=2, keepdims=True)
-    seen = _seen(view, points)
-    return np.einsum("nc,nci->ni", seen.astype(float), ray)
+    return (ray * _seen(view, points)[:, :, None]).sum(axis=1)
 
 
-def _frame_of(normal: np.ndarray) -> np.ndarray:
-    """Right-handed axes (3, 3) with the unit normal as third column (Duff et al. 2017)."""
-    x, y, z = normal
-    sign = 1.0 if z >= 0 else -1.0
+def _frames_of(normals: np.ndarray) -> np.ndarray:
+    """Right-handed axes (N, 3, 3) with the unit normals (N, 3) as third column (Duff et al. 2017)."""
+    x, y, z = normals.T
+    sign = np.where(z >= 0, 1.0, -1.0)
     a = -1.0 / (sign + z)
     b = x * y * a
-    return np.array([[1 + sign * x * x * a, b, x], [sign * b, sign + y * y * a, y], [-sign * x, -y, z]])
+    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
+    second = np.stack([b, sign + y * y * a, -y], axis=1)
+    return np.stack([first, second, normals], axis=2)

@@ -10,11 +10,11 @@ from geomocap.settings import Settings
 class TrackingSettings(Settings):
     """How patches of the surface are placed and followed."""
 
-    n_patches: int = Field(2500, ge=10, le=100_000, description="Patches wanted on the surface at any time")
+    n_patches: int = Field(1500, ge=10, le=100_000, description="Patches wanted on the surface at any time")
     radius_px: int = Field(5, ge=2, le=20, description="Half the width of a patch (pixels)")
     blurs_px: tuple[float, float] = Field((2.5, 0.8), description="Blur of the coarse and the fine level (pixels)")
     seed_every: int = Field(10, ge=1, description="Frames between two looks for surface without patches")
-    seed_correlation: float = Field(0.8, gt=0, lt=1, description="Least correlation between cameras for a new patch")
+    seed_correlation: float = Field(0.85, gt=0, lt=1, description="Least correlation between cameras for a new patch")
     search_front: float = Field(0.015, ge=0, description="How far before the surface a new patch is looked for (m)")
     search_depth: float = Field(0.06, ge=0, description="How far behind the surface a new patch is looked for (m)")
     correlation: float = Field(0.8, gt=0, lt=1, description="Least mean correlation of a tracked patch")

@@ -9,6 +9,7 @@ from geomocap.tracking.trajectories import TOO_FAST, UNLIKE, Trajectories
 from tests.geomocap.made_trajectories import join_tracks, make_tracks, rigid_tracks
 
 FPS = 30.0
+WIDE = FilterSettings(fastest=50, acceleration=5000, unlike=0.015)
 
 
 def cloud(count=60, seed=0):
@@ -95,7 +96,7 @@ def test_a_point_that_leaves_its_neighbours_is_cut_there():
     positions = tracks.positions.copy()
     positions[7, 12:] += np.linspace(0.02, 0.1, 8)[:, None]  # drifts off
     tracks = make_tracks(positions, tracks.rotations)
-    result = filter_trajectories(tracks, smooth_motion(positions, FPS), FilterSettings(fastest=50, acceleration=5000))
+    result = filter_trajectories(tracks, smooth_motion(positions, FPS), WIDE)
     left = result.trajectories
     assert left.measured[7, :12].all() and not left.measured[7, 12:].any()
     assert left.end_reason[7] == UNLIKE
@@ -114,7 +115,7 @@ def test_before_the_frame_of_placing_tracks_are_cut_backward():
     positions[7, :5] += 0.05
     late = make_tracks(positions, tracks.rotations)
     late = Trajectories(**({n: getattr(late, n) for n in late.__dataclass_fields__} | {"placed": np.full(60, 15)}))
-    result = filter_trajectories(late, smooth_motion(positions, FPS), FilterSettings(fastest=50, acceleration=5000))
+    result = filter_trajectories(late, smooth_motion(positions, FPS), WIDE)
     assert not result.trajectories.measured[7, :5].any()
     assert result.trajectories.measured[7, 9:].all()
     assert result.trajectories.begin_reason[7] == UNLIKE and result.trajectories.end_reason[7] == 0
@@ -128,6 +129,6 @@ def test_speed_limits_come_from_the_data_or_are_given():
     given = filter_trajectories(both, motion, FilterSettings(fastest=3.0))
     assert given.cut["too fast"] == 3 and given.kept.tolist() == list(range(60))
     own = filter_trajectories(slow, smooth_motion(slow.positions, FPS))
-    assert_allclose(own.fastest, 2 * 0.3, rtol=1e-6)
+    assert_allclose(own.fastest, 2.5 * 0.3, rtol=1e-6)
     assert own.cut["too fast"] == 0
     assert (given.trajectories.end_reason != TOO_FAST).all()
