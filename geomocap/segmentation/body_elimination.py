@@ -122,7 +122,7 @@ def judge(body: int, model: BodyModel, evidence: Evidence, criterion: Criterion)
     members = np.flatnonzero(model.label == body)
     if not len(neighbours) or not len(members):
         return Candidate(body, np.inf, -1, np.inf, np.inf)
-    turns = [_turn(body, q, model, evidence) for q in neighbours]
+    turns = [_turn(body, int(q), model, evidence) for q in neighbours]
     turn, into = min(zip(turns, neighbours.tolist(), strict=True))
     rest = evidence.rest[members]
     radius = min(float(np.sqrt(((rest - rest.mean(axis=0)) ** 2).sum(axis=1).mean())), criterion.largest_radius)

@@ -1,0 +1,76 @@
+"""Bodies of arbitrary points, as voxels, from the bodies of the samples."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from geomocap.segmentation.motion_bodies import MotionBodies
+from geomocap.segmentation.motion_paths import MotionPaths
+
+_VOTERS = 12
+_NEAREST = 3
+_CHUNK = 65536
+
+
+def label_points(bodies: MotionBodies, paths: MotionPaths, frame: int, points: np.ndarray) -> np.ndarray:
+    """Body of each point of a frame.
+
+    The nearest samples of the frame propose bodies, with votes by distance. A body that is proposed must also fit: the
+    point is carried back to frame 0 by the body's motion, and its distance from the body's own samples there counts
+    against it. A hand at rest on a hip gets few votes inside the hip, and points beside it do not fit the hand's shape.
+
+    Parameters
+    ----------
+    bodies : MotionBodies
+    paths : MotionPaths
+        From which the bodies were found; samples that are not seen in the frame vote less.
+    frame : int
+    points : (M, 3) float, metres, world
+
+    Returns
+    -------
+    (M,) int32
+    """
+    points = np.asarray(points, float).reshape(-1, 3)
+    if not len(points) or not bodies.body_count:
+        return np.full(len(points), -1, np.int32)
+    samples = bodies.positions[:, frame]
+    trust = np.where(paths.seen[:, frame], 1.0, 0.3)
+    spacing = float(np.median(cKDTree(bodies.rest).query(bodies.rest, 2)[0][:, 1]))
+    shapes = [cKDTree(bodies.rest[bodies.label == b]) for b in range(bodies.body_count)]
+    tree = cKDTree(samples)
+    parts = [
+        _label_some(bodies, frame, points[i : i + _CHUNK], tree, trust, shapes, spacing)
+        for i in range(0, len(points), _CHUNK)
+    ]
+    return np.concatenate(parts)
+
+
+def _label_some(
+    bodies: MotionBodies,
+    frame: int,
+    points: np.ndarray,
+    tree: cKDTree,
+    trust: np.ndarray,
+    shapes: list[cKDTree],
+    spacing: float,
+) -> np.ndarray:
+    voters = min(_VOTERS, tree.n)
+    distances, nearest = tree.query(points, voters)
+    distances, nearest = distances.reshape(len(points), voters), nearest.reshape(len(points), voters)
+    votes = trust[nearest] / (distances**2 + (0.5 * spacing) ** 2)
+    score = np.zeros((len(points), bodies.body_count))
+    for v in range(voters):
+        score += votes[:, v, None] * bodies.weights[nearest[:, v]]
+    score /= score.sum(axis=1, keepdims=True)
+    for b in range(bodies.body_count):
+        proposed = np.flatnonzero(score[:, b] > 0.05)
+        score[score[:, b] <= 0.05, b] = 0.0
+        if not len(proposed):
+            continue
+        back = (points[proposed] - bodies.translations[frame, b]) @ bodies.rotations[frame, b]
+        k = min(_NEAREST, shapes[b].n)
+        away = shapes[b].query(back, k)[0].reshape(len(back), k).mean(axis=1)
+        score[proposed, b] *= np.exp(-0.5 * (away / (2.0 * spacing)) ** 2) + 1e-6
+    return score.argmax(axis=1).astype(np.int32)

@@ -1,0 +1,229 @@
+"""The skeleton of bodies found from motion paths: joints, hierarchy, and bones that keep their length."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from geomocap.errors import GeometryError
+from geomocap.segmentation.motion_bodies import MotionBodies
+from geomocap.segmentation.surface_graph import frames_looked_at
+from geomocap.settings import Settings
+from geomocap.skeleton.articulated_motion import fit_articulated, prior_moments
+from geomocap.skeleton.common_points import CommonPoint, common_point
+from geomocap.skeleton.hierarchy import Hierarchy
+from geomocap.skeleton.motion import local_rotations
+from geomocap.skeleton.skeleton import Skeleton
+from geomocap.skeleton.spanning_tree import Connection, connect_by_cost, connection_cost
+
+_NEAREST = 6
+_FRAMES = 10
+
+
+class MotionSkeletonSettings(Settings):
+    """How joints are found between bodies, and how these are connected."""
+
+    interface_prior: float = Field(
+        default=0.003,
+        gt=0,
+        description="weight of the place where bodies touch (frames in which they turn by a radian)",
+    )
+    hinge_share: float = Field(
+        default=0.1, ge=0, lt=1, description="hinge: turns about other axes are less than this share of all (0..1)"
+    )
+    interface_weight: float = Field(
+        default=0.15, ge=0, description="tree: weight of a joint's distance from where its bodies touch (no unit)"
+    )
+    gap_weight: float = Field(default=0.5, ge=0, description="tree: weight of the bodies' distance (no unit)")
+    contact_weight: float = Field(
+        default=0.01, ge=0, description="tree: cost of bodies without common border (extents)"
+    )
+    largest_gap: float = Field(default=0.1, gt=0, description="bodies farther apart are not connected (extents)")
+    smoothing: float = Field(
+        default=0.0,
+        ge=0,
+        description="ties turns to those of the frames before and after (times the bodies' own samples)",
+    )
+    rounds: int = Field(default=6, ge=1, description="rounds of the fit that keeps joints together")
+
+
+@dataclass(frozen=True)
+class MotionSkeleton:
+    """A skeleton and what is known of its joints.
+
+    Attributes
+    ----------
+    skeleton : Skeleton
+    joints : tuple of CommonPoint
+        In the order of the skeleton's joints.
+    costs : (J,) float, metres
+        What each connection cost.
+    """
+
+    skeleton: Skeleton
+    joints: tuple[CommonPoint, ...]
+    costs: np.ndarray
+
+
+def find_motion_skeleton(
+    bodies: MotionBodies, fps: float, settings: MotionSkeletonSettings | None = None
+) -> MotionSkeleton:
+    """Find the joints, connect the bodies, and let bones keep their length.
+
+    Parameters
+    ----------
+    bodies : MotionBodies
+    fps : float
+        Frames per second.
+    settings : MotionSkeletonSettings, optional
+
+    Raises
+    ------
+    GeometryError
+        If there are no bodies.
+    """
+    settings = settings or MotionSkeletonSettings()
+    count = bodies.body_count
+    if count == 0:
+        raise GeometryError("no rigid bodies to connect: at least two frames with motion are needed")
+    sizes = np.bincount(bodies.label[bodies.label >= 0], minlength=count) / len(bodies.label)
+    # A joint between any two bodies that come near each other
+    connections = possible_connections(bodies, settings)
+    # The tree
+    hierarchy, chosen = connect_by_cost(connections, count, sizes)
+    joints = np.array([c.joint.point for c in chosen]).reshape(-1, 3)
+    # Bones that keep their length
+    middle = np.stack([bodies.rest[bodies.label == b].mean(axis=0) for b in range(count)])
+    spread = [np.sqrt(((bodies.rest[bodies.label == b] - middle[b]) ** 2).sum(axis=1).mean()) for b in range(count)]
+    weights = bodies.reliability * sizes * len(bodies.label) + 1e-3
+    moments = prior_moments(bodies.rotations, bodies.translations, middle, np.array(spread), weights)
+    motion = fit_articulated(moments, hierarchy, joints, bodies.rotations, settings.smoothing, settings.rounds)
+    centers = np.einsum("tbij,bj->tbi", motion.rotations, middle) + motion.translations
+    skeleton = skeleton_of_motion(hierarchy, joints, motion.rotations, motion.joint_positions, centers, middle, fps)
+    return MotionSkeleton(skeleton, tuple(c.joint for c in chosen), np.array([c.cost for c in chosen]))
+
+
+def possible_connections(bodies: MotionBodies, settings: MotionSkeletonSettings) -> list[Connection]:
+    """Joints between all bodies that come near each other, and more until every body can be reached."""
+    count = bodies.body_count
+    limit = settings.largest_gap * bodies.extent
+    gaps, interfaces = _interfaces(bodies, limit)
+    contact = _contacts(bodies)
+    border = np.maximum(contact.sum(axis=1), 1)
+    while connected_components(csr_matrix(gaps <= limit))[0] > 1:
+        limit *= 2.0
+        gaps, interfaces = _interfaces(bodies, limit)
+    weights = (settings.interface_weight, settings.gap_weight, settings.contact_weight * bodies.extent)
+    noise = 2e-4 * bodies.extent
+    result = []
+    for a in range(count):
+        for b in range(a + 1, count):
+            if gaps[a, b] > limit:
+                continue
+            joint = common_point(
+                (bodies.rotations[:, a], bodies.rotations[:, b]),
+                (bodies.translations[:, a], bodies.translations[:, b]),
+                np.minimum(bodies.reliability[:, a], bodies.reliability[:, b]) + 1e-3,
+                interfaces[a, b],
+                settings.interface_prior,
+                noise,
+                settings.hinge_share,
+            )
+            off = float(np.linalg.norm(joint.point - interfaces[a, b]))
+            share = float(contact[a, b] / min(border[a], border[b]))
+            cost = connection_cost(joint.miss, off, gaps[a, b], share, weights)
+            result.append(Connection((a, b), joint, interfaces[a, b], float(gaps[a, b]), cost))
+    return result
+
+
+def _interfaces(bodies: MotionBodies, limit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Lasting distance of each two bodies beyond that of neighbours, and the middle of their border in frame 0.
+
+    A sample is on the border if it stays near the other body, though perhaps not near the same sample of it: a shaft
+    that turns in its bearing touches it all around.
+    """
+    count = bodies.body_count
+    apart = bodies.lasting + np.diag(np.full(len(bodies.lasting), np.inf, np.float32))
+    spacing = float(np.median(apart.min(axis=1)))
+    members = [np.flatnonzero(bodies.label == b) for b in range(count)]
+    looked_at = frames_looked_at(bodies.positions.shape[1], _FRAMES)
+    moved = [bodies.positions[m][:, looked_at] for m in members]
+    trees = [[cKDTree(part[:, f]) for f in range(len(looked_at))] for part in moved]
+    gaps = np.full((count, count), np.inf)
+    interfaces = np.zeros((count, count, 3))
+    np.fill_diagonal(gaps, 0.0)
+    for a in range(count):
+        for b in range(a + 1, count):
+            if bodies.lasting[np.ix_(members[a], members[b])].min() > limit:
+                continue
+            sides, nearest = [], []
+            for one, other in ((a, b), (b, a)):
+                distances = np.stack([trees[other][f].query(moved[one][:, f])[0] for f in range(len(looked_at))])
+                lasting = np.sort(distances, axis=0)[-2 if len(looked_at) > 5 else -1]
+                few = np.sort(lasting)[: min(_NEAREST, len(lasting))]
+                near = lasting <= max(float(few[-1]), 1.5 * spacing)
+                sides.append(bodies.rest[members[one][near]].mean(axis=0))
+                nearest.append(float(few[:3].mean()))
+            gaps[a, b] = gaps[b, a] = max(min(nearest) - 2.0 * spacing, 0.0)
+            interfaces[a, b] = interfaces[b, a] = 0.5 * (sides[0] + sides[1])
+    return gaps, interfaces
+
+
+def _contacts(bodies: MotionBodies) -> np.ndarray:
+    rows, columns = bodies.adjacency.nonzero()
+    result = np.zeros((bodies.body_count, bodies.body_count))
+    np.add.at(result, (bodies.label[rows], bodies.label[columns]), 1)
+    np.fill_diagonal(result, 0)
+    return result
+
+
+def skeleton_of_motion(
+    hierarchy: Hierarchy,
+    joints: np.ndarray,
+    rotations: np.ndarray,
+    joint_positions: np.ndarray,
+    centers: np.ndarray,
+    middle: np.ndarray,
+    fps: float,
+) -> Skeleton:
+    """Skeleton of a motion whose joints are fixed in both bodies.
+
+    Parameters
+    ----------
+    hierarchy : Hierarchy
+    joints : (J, 3) float, metres, world
+        In frame 0.
+    rotations : (T, B, 3, 3) float
+        Since frame 0, world axes.
+    joint_positions : (T, J, 3) float, metres, world
+    centers : (T, B, 3) float, metres, world
+        Of the bodies.
+    middle : (B, 3) float, metres, world
+        Of the bodies in frame 0.
+    fps : float
+    """
+    own = hierarchy.body_joints
+    anchors = np.where((own >= 0)[:, None], joints[own] if len(joints) else middle, middle)
+    offsets = joints - anchors[hierarchy.joint_bodies[:, 0]]
+    names = np.array([f"body{b:02d}" for b in range(len(middle))])
+    joint_names = np.array([f"joint_{names[p]}_{names[c]}" for p, c in hierarchy.joint_bodies], dtype=np.str_)
+    return Skeleton(
+        joint_positions,
+        hierarchy.joint_bodies,
+        joint_names,
+        names,
+        rotations,
+        centers,
+        hierarchy.root,
+        centers[:, hierarchy.root],
+        offsets,
+        middle - anchors,
+        local_rotations(rotations, hierarchy),
+        True,
+        float(fps),
+    )
