@@ -148,7 +148,7 @@ def fit_articulated(
 
 
 def _chains(hierarchy: Hierarchy, joints: np.ndarray, bodies: int) -> tuple[np.ndarray, np.ndarray]:
-    """Arms (B, B, 3): part of body a in the chain to body b; anchors (B, 3): own joint of each body (root: its first)."""
+    """Arms (B, B, 3): part of body a in the chain to body b; anchors (B, 3): own joint of each body."""
     arms = np.zeros((bodies, bodies, 3))
     anchors = np.zeros((bodies, 3))
     anchors[hierarchy.root] = joints[0] if len(joints) else 0.0
