@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from geomocap.calibration.calibrate import Calibration
-from geomocap.calibration.quality import CameraPrecision
 from geomocap.files import write_atomic
 from viz.figures import plot
 from viz.palette import ACCENT, INK, body_color, hex_color
@@ -77,7 +76,8 @@ def report_of(calibration: Calibration, plots: dict[str, bytes]) -> Report:
                     f"datum is held by all bar ends. A bar end is known to "
                     f"{1000 * c.covariance.point_sigma:.3f} mm in each axis."
                 ),
-                camera_table(c),
+                interior_table(c),
+                pose_table(c),
                 distortion_table(c),
                 *tests_block(c),
             ),
@@ -134,45 +134,39 @@ def report_of(calibration: Calibration, plots: dict[str, bytes]) -> Report:
     return Report("Calibration", lead, tuple((value, label) for label, value in figures), sections)
 
 
-def camera_table(calibration: Calibration) -> Block:
-    """Table of cameras: constant, principal point, centre, residuals, with standard deviations."""
+def interior_table(calibration: Calibration) -> Block:
+    """Table of cameras: constants, principal point, rays and residuals, with standard deviations."""
     rows = []
     for k, p in enumerate(calibration.precision):
-        camera, center = calibration.rig.cameras[k], calibration.rig.centers[k]
+        camera = calibration.rig.cameras[k]
+        values = {
+            "fx": camera.focal_length_x,
+            "fy": camera.focal_length_y,
+            "cx": camera.principal_point_x,
+            "cy": camera.principal_point_y,
+        }
+        words = []
+        for key, value in values.items():
+            sigma = p.parameters.get(key, (value, float("nan")))[1]
+            words.append(f"{value:.2f}\u00a0±\u00a0{sigma:.2f}" if np.isfinite(sigma) else f"{value:.2f}")
+        rows.append((p.camera, f"{camera.width}×{camera.height}", *words, f"{p.rays}", f"{p.rms_px:.3f}"))
+    head = ("camera", "image", "fx (px)", "fy (px)", "cx (px)", "cy (px)", "rays", "RMS (px)")
+    return table(head, rows, numbers=(2, 3, 4, 5, 6, 7), colors=_colors(len(rows)))
 
-        def value(key: str, fallback: float, digits: int, p: CameraPrecision = p) -> str:
-            v, s = p.parameters.get(key, (fallback, float("nan")))
-            return f"{v:.{digits}f}\u00a0±\u00a0{s:.{digits}f}" if np.isfinite(s) else f"{v:.{digits}f}"
 
-        rows.append(
-            (
-                p.camera,
-                f"{camera.width}×{camera.height}",
-                value("fx", camera.focal_length_x, 2),
-                value("fy", camera.focal_length_y, 2),
-                value("cx", camera.principal_point_x, 2),
-                value("cy", camera.principal_point_y, 2),
-                f"({center[0]:.3f}, {center[1]:.3f}, {center[2]:.3f})",
-                f"{1000 * p.center_sigma:.2f}",
-                f"{p.angle_sigma_deg:.4f}",
-                f"{p.rays}",
-                f"{p.rms_px:.3f}",
-            )
+def pose_table(calibration: Calibration) -> Block:
+    """Table of the cameras' centres and the standard deviations of their poses."""
+    rows = [
+        (
+            p.camera,
+            *(f"{v:.4f}" for v in center),
+            f"{1000 * p.center_sigma:.2f}",
+            f"{p.angle_sigma_deg:.4f}",
         )
-    head = (
-        "camera",
-        "image",
-        "fx (px)",
-        "fy (px)",
-        "cx (px)",
-        "cy (px)",
-        "centre (m)",
-        "± (mm)",
-        "turn ± (°)",
-        "rays",
-        "RMS (px)",
-    )
-    return table(head, rows, numbers=(2, 3, 4, 5, 7, 8, 9, 10), colors=_colors(len(rows)))
+        for p, center in zip(calibration.precision, calibration.rig.centers, strict=True)
+    ]
+    head = ("camera", "centre x (m)", "y (m)", "z (m)", "centre ± (mm)", "turn ± (°)")
+    return table(head, rows, numbers=(1, 2, 3, 4, 5), colors=_colors(len(rows)))
 
 
 def distortion_table(calibration: Calibration) -> Block:
