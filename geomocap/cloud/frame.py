@@ -237,6 +237,9 @@ def measure_template(
         reasons["outside another silhouette"] += int((~inside).sum())
         points, cells = points.select(inside), cells[inside]
     reasons["matched"] = len(points)
+    if len(searches) > 1:
+        # Of the matched: where this is nearly all, one camera is out of focus, blocked or wrongly calibrated
+        reasons["matched in one search image only"] = int((points.views == 2).sum())
     return TemplateCloud(group, surface, points, cells), {k: v for k, v in reasons.items() if v}
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numba
 import numpy as np
 
 from geomocap.matching import grow_kernel as gk
@@ -20,6 +21,7 @@ from geomocap.matching.spline import ImageStack
 
 _LEFT, _RIGHT, _ABOVE, _BELOW = range(4)
 _GAP = 3
+_FEW = 96
 
 
 def limits_of(settings: GrowingSettings, kernel: KernelSettings, least_images: int = 1) -> np.ndarray:
@@ -168,7 +170,12 @@ class Front:
         images = self.images
         out = out or self._buffers(len(points))
         planes = np.ascontiguousarray(planes)
-        if len(points):
+        if len(points) == 0:
+            return planes
+        # A handful of points is not worth waking the other threads for
+        threads = numba.get_num_threads()
+        numba.set_num_threads(threads if len(points) > _FEW else 1)
+        try:
             gk.match_points(
                 images.flat,
                 images.masks,
@@ -183,6 +190,8 @@ class Front:
                 planes,
                 *out,
             )
+        finally:
+            numba.set_num_threads(threads)
         return planes
 
     # --- orders ---

@@ -148,7 +148,8 @@ def consistent(grid: Grid, matches: Matches, matched: np.ndarray, settings: Grow
     """Say which matched cells agree with their neighbours.
 
     Two neighbours agree if, in every image that saw both, each lies where the other's affine matrix predicts it. A
-    cell stays if at least half of its matched neighbours agree with it and it hangs together with enough others.
+    cell stays if at least half of its matched neighbours agree with it and it hangs together with enough others; with
+    more if one search image alone saw them all.
 
     Returns
     -------
@@ -177,8 +178,15 @@ def consistent(grid: Grid, matches: Matches, matched: np.ndarray, settings: Grow
     links = agree & kept[source] & kept[target]
     graph = coo_matrix((np.ones(links.sum(), np.int8), (source[links], target[links])), shape=(count, count))
     _, label = connected_components(graph, directed=False)
-    size = np.bincount(label[kept], minlength=label.max(initial=0) + 1)
-    return kept & (size[label] >= settings.minimum_patch)
+    number = label.max(initial=0) + 1
+    size = np.bincount(label[kept], minlength=number)
+    kept &= size[label] >= settings.minimum_patch
+    if matches.status.shape[1] > 1:
+        # What no second image confirms may be chance, the more so with wrong cameras: only large patches are none
+        several = kept & (matches.matched.sum(axis=1) > 1)
+        confirmed = np.bincount(label[several], minlength=number) >= np.maximum(settings.confirmed * size, 1)
+        kept &= confirmed[label] | (size[label] >= settings.minimum_pair_patch)
+    return kept
 
 
 def _count(status: np.ndarray, matched: np.ndarray, kept: np.ndarray) -> dict[str, int]:

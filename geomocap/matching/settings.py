@@ -66,3 +66,9 @@ class GrowingSettings(Settings):
     tilting: bool = Field(True, description="whether holes are also tried on planes tilted otherwise, as at an edge")
     agreement: float = Field(0.6, gt=0, description="greatest departure from what a neighbour predicts (px)")
     minimum_patch: int = Field(40, ge=1, description="least number of points that hang together")
+    minimum_pair_patch: int = Field(
+        400, ge=1, description="the same where no point of the patch was seen by more than one search image of several"
+    )
+    confirmed: float = Field(
+        0.02, ge=0, le=1, description="share of a patch seen by several search images that makes it more than a pair's"
+    )

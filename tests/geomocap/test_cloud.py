@@ -73,7 +73,7 @@ def test_normals_colours_and_attributes(sharp: CloudFrame) -> None:
     assert (p.template == 1).all()
     assert sharp.reasons["matched"] == len(p)
     cells = sharp.templates[0].surface
-    known = ("seed", "images disagree", "outside another silhouette")
+    known = ("seed", "images disagree", "outside another silhouette", "matched in one")
     total = sum(n for reason, n in sharp.reasons.items() if not reason.startswith(known))
     assert total + sharp.reasons.get("outside another silhouette", 0) == len(cells.grid)
 
