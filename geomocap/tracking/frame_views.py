@@ -15,6 +15,7 @@ from geomocap.errors import GeometryError
 from geomocap.geometry import Voxels
 
 _ALL_FACES = 63
+_MARGIN_PX = 2
 _EMPTY = 1e-3  # share of subject under the blur below which a pixel has no value
 
 
@@ -28,6 +29,8 @@ class FrameViews:
         Grey images without background, blurred, coarsest first.
     masks : (C, H, W) uint8
         1 where the subject is.
+    allowed : (C, H, W) uint8
+        1 where the subject may be: the silhouettes widened by two pixels, and what the real image doesn't see.
     depth : (C, H, W) float32
         Depth of the surface along the optical axis, metres; inf where there is none.
     projections : (C, 3, 4) float
@@ -41,6 +44,7 @@ class FrameViews:
 
     levels: np.ndarray
     masks: np.ndarray
+    allowed: np.ndarray
     depth: np.ndarray
     projections: np.ndarray
     centers: np.ndarray
@@ -78,7 +82,10 @@ class FrameViews:
         P = P * np.sign(np.linalg.det(P[:, :, :3]))[:, None, None]
         P[:, :2] -= 0.5 * P[:, 2:]
         levels = np.zeros((len(blurs_px), C, H, W), np.float32)
+        wide = np.ones((2 * _MARGIN_PX + 1,) * 2, np.uint8)
+        allowed = np.empty_like(views.masks)
         for c in range(C):
+            allowed[c] = cv2.dilate(views.masks[c], wide) | (views.valid[c] == 0)
             _blur(images[c], views.masks[c], blurs_px, levels[:, c])
         low = voxels.indices.min(axis=0)
         top = voxels.indices.max(axis=0) + 1 - low
@@ -88,7 +95,14 @@ class FrameViews:
         depth = depth_buffers(views, grid, SurfaceVoxels(indices, np.full(len(indices), _ALL_FACES, np.uint8)))
         centers = -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[:, :, 0]
         return cls(
-            levels, views.masks, depth, np.ascontiguousarray(P), centers, voxels.points, float(voxels.voxel_size)
+            levels,
+            views.masks,
+            allowed,
+            depth,
+            np.ascontiguousarray(P),
+            centers,
+            voxels.points,
+            float(voxels.voxel_size),
         )
 
     @property
@@ -111,14 +125,24 @@ class FrameViews:
 
     def surface_depth(self, points: np.ndarray) -> np.ndarray:
         """Return the surface's depth at the pixels that show world points (N, 3): (N, C), NaN where none is seen."""
+        inside, row, column = self._pixels(points)
+        found = self.depth[np.arange(self.count), row, column].astype(np.float64)
+        return np.where(inside & np.isfinite(found), found, np.nan)
+
+    def may_be_subject(self, points: np.ndarray) -> np.ndarray:
+        """Whether world points (N, 3) lie in the silhouettes of all cameras that see them, or close by: (N,) bool."""
+        inside, row, column = self._pixels(points)
+        return ((self.allowed[np.arange(self.count), row, column] != 0) | ~inside).all(axis=1)
+
+    def _pixels(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Whether world points (N, 3) are in the images, and the rows and columns that show them, all (N, C)."""
         pixel, _ = self.project(points)
-        C, H, W = self.masks.shape
+        _, H, W = self.masks.shape
         inside = np.isfinite(pixel).all(axis=2)
         column = np.rint(np.where(inside, pixel[:, :, 0], -1)).clip(-1, W).astype(np.int64)
         row = np.rint(np.where(inside, pixel[:, :, 1], -1)).clip(-1, H).astype(np.int64)
         inside &= (column >= 0) & (row >= 0) & (column < W) & (row < H)
-        found = self.depth[np.arange(C), row.clip(0, H - 1), column.clip(0, W - 1)].astype(np.float64)
-        return np.where(inside & np.isfinite(found), found, np.nan)
+        return inside, row.clip(0, H - 1), column.clip(0, W - 1)
 
 
 def _blur(image: np.ndarray, mask: np.ndarray, blurs_px: Sequence[float], out: np.ndarray) -> None:

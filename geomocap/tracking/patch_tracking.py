@@ -21,6 +21,7 @@ from geomocap.tracking.trajectories import (
     LAST_FRAME,
     LOW_CORRELATION,
     LOW_PRECISION,
+    OUTSIDE,
     UNSEEN,
     Trajectories,
 )
@@ -31,6 +32,7 @@ _NEW_TEMPLATE_CORRELATION = 0.9
 _SURE = 0.9  # correlation from which no second start is tried
 _NEIGHBOURS = 8
 _AGREEING = 3  # neighbours whose motion a patch must share
+_SLACK_VOXELS = 2.0
 _SMOOTH = 0.7  # share of the newest motion in the velocity
 
 
@@ -205,7 +207,7 @@ def _next(
     if not len(state.patches):
         return state
     found = _search(state, previous, view, settings)
-    reason = _judge(state, found, settings)
+    reason = _judge(state, found, view, settings)
     good = reason == LAST_FRAME
     found = _carry_lost(state, found, good)
     old = state.patches
@@ -234,7 +236,7 @@ def _search(state: Followed, previous: FrameViews, view: FrameViews, settings: T
     patches = state.patches
     N = len(patches)
     every = np.arange(N)
-    slack = settings.slack_px * patches.size[:, None]
+    slack = _slack(patches, view, settings.slack_px)
     seen = visible(patches, patches.positions, patches.frames, previous, slack, _FACING) & patches.has
     flow = image_flow(previous, view, patches.positions, seen)
     lifted = patches.positions + lift_flow(previous, patches.positions, flow)
@@ -273,7 +275,7 @@ def _best_start(
     settings: TrackingSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compare starts on the coarse level and return the best for each patch."""
-    slack = settings.slack_px * patches.size[:, None]
+    slack = _slack(patches, view, settings.slack_px)
     best = np.full(len(patches), -3.0)
     X, Q = starts[0][0].copy(), starts[0][1].copy()
     for positions, frames in starts:
@@ -293,7 +295,7 @@ def _align(
     settings: TrackingSettings,
 ) -> Alignment:
     """Align patches with the cameras that see them where they start."""
-    slack = settings.slack_px * patches.size[:, None]
+    slack = _slack(patches, view, settings.slack_px)
     use = visible(patches, *start, view, slack, _FACING) & patches.has
     return align(
         patches,
@@ -306,13 +308,19 @@ def _align(
     )
 
 
-def _judge(state: Followed, found: Alignment, settings: TrackingSettings) -> np.ndarray:
+def _slack(patches: Patches, view: FrameViews, slack_px: float) -> np.ndarray:
+    """Depth by which something must lie before patches to hide them, (N, 1), metres: not a voxel that sticks out."""
+    return slack_px * patches.size[:, None] + _SLACK_VOXELS * view.voxel_size
+
+
+def _judge(state: Followed, found: Alignment, view: FrameViews, settings: TrackingSettings) -> np.ndarray:
     """Return why each patch can't be taken as measured, (N,) int; `LAST_FRAME` (0) where it can."""
     size = state.patches.size
     reason = np.full(len(size), LAST_FRAME)
     reason[found.sigma > settings.sigma_px * size] = LOW_PRECISION
     reason[found.correlation < settings.correlation] = LOW_CORRELATION
     reason[found.n_views < settings.n_views] = UNSEEN
+    reason[(reason == LAST_FRAME) & ~view.may_be_subject(found.positions)] = OUTSIDE
     good = np.flatnonzero(reason == LAST_FRAME)
     near = nearest(state.patches.positions, good, good, _NEIGHBOURS)
     if near.shape[1] >= _AGREEING:
@@ -343,7 +351,7 @@ def _carry_lost(state: Followed, found: Alignment, good: np.ndarray) -> Alignmen
 
 def _new_views(patches: Patches, sure: np.ndarray, view: FrameViews, settings: TrackingSettings) -> Patches:
     """Take templates in cameras that have come to see a well-measured patch."""
-    slack = 0.5 * settings.slack_px * patches.size[:, None]
+    slack = _slack(patches, view, 0.5 * settings.slack_px)
     cosine = facings(patches.positions, patches.normals, view)
     want = visible(patches, patches.positions, patches.frames, view, slack, _FACING) & ~patches.has
     want &= (cosine > _NEW_TEMPLATE_FACING) & sure[:, None]

@@ -198,7 +198,7 @@ def _lock(
     agree = others & (found.by_camera >= settings.camera_correlation)
     mean = np.where(agree, found.by_camera, 0).sum(axis=1) / np.maximum(agree.sum(axis=1), 1)
     keep = (agree.sum(axis=1) >= settings.n_views - 1) & (mean >= settings.seed_correlation)
-    keep &= found.sigma < settings.sigma_px * patches.size
+    keep &= (found.sigma < settings.sigma_px * patches.size) & view.may_be_subject(found.positions)
     agree[rows, reference] = True
     patches = patches.moved(found.positions, found.frames).select(keep)
     own = with_templates(

@@ -21,7 +21,7 @@ class TrackingSettings(Settings):
     camera_correlation: float = Field(0.6, gt=0, lt=1, description="Least correlation for a camera to count")
     n_views: int = Field(2, ge=1, description="Least number of cameras that see a tracked patch")
     sigma_px: float = Field(0.35, gt=0, description="Largest standard deviation of a position (pixels on the patch)")
-    slack_px: float = Field(8.0, gt=0, description="Depth by which something must lie before a patch to hide it (px)")
+    slack_px: float = Field(8.0, gt=0, description="Depth, beyond two voxels, of what hides a patch (pixels on it)")
     neighbour_px: float = Field(3.0, gt=0, description="Largest distance from where neighbours' motion puts it (px)")
     longest_gap: int = Field(8, ge=0, description="Frames that a lost patch is carried along by its neighbours")
     backward: bool = Field(True, description="Follow patches placed in later frames backward as well")

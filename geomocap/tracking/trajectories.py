@@ -19,10 +19,11 @@ REASONS = (
     "accelerated too much",
     "unlike the motion around it",
     "too short",
+    "outside the silhouettes",
 )
 """Why a trajectory ends (or begins no earlier), by number."""
 
-LAST_FRAME, UNSEEN, LOW_CORRELATION, LOW_PRECISION, APART, TOO_FAST, TOO_JERKY, UNLIKE, TOO_SHORT = range(9)
+LAST_FRAME, UNSEEN, LOW_CORRELATION, LOW_PRECISION, APART, TOO_FAST, TOO_JERKY, UNLIKE, TOO_SHORT, OUTSIDE = range(10)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from geomocap.geometry import Voxels
 from geomocap.tracking.frame_views import FrameViews
 
 RADII = np.array([0.20, 0.16, 0.25])
-WIDTH, HEIGHT, FOCAL = 160, 120, 260.0
 VOXEL = 0.01
 
 
@@ -24,6 +23,9 @@ class MovingEllipsoid:
     shift: tuple[float, float, float] = (0.02, -0.008, 0.005)
     turn_deg: tuple[float, float, float] = (1.0, -1.5, 4.0)
     distance: float = 1.0
+    width: int = 160
+    height: int = 120
+    focal: float = 260.0
 
     def pose(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Return rotation (3, 3) and translation (3,) of a frame."""
@@ -39,7 +41,7 @@ class MovingEllipsoid:
             right = np.cross(forward, [0, 0, 1])
             right /= np.linalg.norm(right)
             R = np.stack([right, np.cross(forward, right), forward])
-            K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+            K = np.array([[self.focal, 0, self.width / 2], [0, self.focal, self.height / 2], [0, 0, 1]])
             out.append(K @ np.c_[R, -R @ center])
         return np.array(out)
 
@@ -52,9 +54,9 @@ class MovingEllipsoid:
     def images(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Return images (C, H, W, 3) uint8 and masks (C, H, W) uint8."""
         turn, place = self.pose(frame)
-        images = np.full((self.n_cameras, HEIGHT, WIDTH, 3), 40, np.uint8)
-        masks = np.zeros((self.n_cameras, HEIGHT, WIDTH), np.uint8)
-        v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        images = np.full((self.n_cameras, self.height, self.width, 3), 40, np.uint8)
+        masks = np.zeros((self.n_cameras, self.height, self.width), np.uint8)
+        v, u = np.mgrid[: self.height, : self.width] + 0.5
         pixel = np.stack([u, v, np.ones_like(u)], axis=-1)
         for c, P in enumerate(self.projections()):
             center = -np.linalg.solve(P[:, :3], P[:, 3])
