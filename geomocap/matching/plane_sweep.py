@@ -1,4 +1,4 @@
-"""Correlation of template patches laid on planes in object space, compiled.
+"""Sweeps of template patches over planes in object space, compiled.
 
 Images stand one behind the other in `flat`, the template first, row by row without padding; `seen` is 1 where they show
 the subject. Positions are array indices; correlation uses every second pixel and bilinear values of smoothed images.
@@ -13,9 +13,8 @@ import cv2
 import numpy as np
 from numba import njit, prange
 
-from geomocap.matching.grow_kernel import plane_start
 from geomocap.matching.patch_kernel import transfer
-from geomocap.matching.spline import FAST
+from geomocap.matching.plane_patch import on_plane, refine, template_patch
 
 
 @dataclass(frozen=True)
@@ -50,137 +49,6 @@ class SweepImages:
         return cls(np.concatenate([s.ravel() for s in smooth]), np.concatenate(seen), shapes, starts)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _correlate(flat, start, height, width, f, offsets, variance, position, affine, radius):
-    """Normalised correlation of the centred template samples `f` at `offsets` with an image under a warp, bilinear."""
-    ex = (abs(affine[0]) + abs(affine[1])) * radius
-    ey = (abs(affine[2]) + abs(affine[3])) * radius
-    px, py = position
-    if not (px - ex >= 0 and py - ey >= 0 and px + ex < width - 1 and py + ey < height - 1):
-        return -2.0
-    s = ss = sf = 0.0
-    n = len(f)
-    for i in range(n):
-        dx, dy = offsets[i]
-        x = px + affine[0] * dx + affine[1] * dy
-        y = py + affine[2] * dx + affine[3] * dy
-        ix = int(x)
-        iy = int(y)
-        tx = x - ix
-        ty = y - iy
-        at = start + iy * width + ix
-        top = flat[at] + tx * (flat[at + 1] - flat[at])
-        bottom = flat[at + width] + tx * (flat[at + width + 1] - flat[at + width])
-        g = top + ty * (bottom - top)
-        s += g
-        ss += g * g
-        sf += g * f[i]
-    spread = ss - s * s / n
-    if not spread > 1e-6 * ss:
-        return -2.0
-    return sf / math.sqrt(spread * variance)
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def on_plane(
-    transfers, shapes, starts, flat, x, y, plane, f, offsets, variance, radius, position, affine, point, each, only
-):
-    """Mean correlation with the template patch laid on a plane, of all images or `only` one; each into `each`."""
-    each[:] = -2.0
-    if not plane_start(transfers, x, y, plane, position, affine, point):
-        return -2.0
-    total = 0.0
-    count = 0
-    for k in range(len(transfers)):
-        if only >= 0 and k != only:
-            continue
-        h, w = shapes[k + 1]
-        each[k] = _correlate(flat, starts[k + 1], h, w, f, offsets, variance, position[k], affine[k], radius)
-        total += each[k]
-        count += 1
-    return total / count
-
-
-@njit(cache=True, nogil=True)
-def _template_patch(flat, seen, height, width, ix, iy, radius):
-    """Centred samples of every second template pixel of the subject, their offsets, and the sum of their squares."""
-    side = radius + 1
-    f = np.empty(side * side)
-    offsets = np.empty((side * side, 2))
-    n = 0
-    mean = 0.0
-    if ix >= radius and iy >= radius and ix + radius < width and iy + radius < height:
-        for dy in range(-radius, radius + 1, 2):
-            for dx in range(-radius, radius + 1, 2):
-                at = (iy + dy) * width + ix + dx
-                if seen[at]:
-                    f[n] = flat[at]
-                    offsets[n] = dx, dy
-                    mean += f[n]
-                    n += 1
-    variance = 0.0
-    if n >= 0.3 * side * side:
-        for i in range(n):
-            f[i] -= mean / n
-            variance += f[i] * f[i]
-    return f[:n], offsets[:n], variance
-
-
-@njit(cache=True, nogil=True)
-def _refine(
-    transfers,
-    shapes,
-    starts,
-    flat,
-    x,
-    y,
-    plane,
-    depth_step,
-    slope_step,
-    top,
-    f,
-    offsets,
-    variance,
-    radius,
-    position,
-    affine,
-    point,
-    trial,
-    each,
-    only,
-):
-    """Improve a plane, one unknown after the other with halved steps; returns its mean correlation."""
-    for _ in range(4):
-        depth_step *= 0.5
-        slope_step *= 0.5
-        for unknown in range(3):
-            for sign in (-1.0, 1.0):
-                trial[:] = plane
-                trial[unknown] += sign * (depth_step if unknown == 0 else slope_step)
-                total = on_plane(
-                    transfers,
-                    shapes,
-                    starts,
-                    flat,
-                    x,
-                    y,
-                    trial,
-                    f,
-                    offsets,
-                    variance,
-                    radius,
-                    position,
-                    affine,
-                    point,
-                    each,
-                    only,
-                )
-                if total > top:
-                    top = total
-                    plane[:] = trial
-    return top
-
-
 @njit(cache=True, nogil=True, parallel=True)
 def tilt_planes(
     flat, seen, shapes, starts, transfers, points, planes, focal, radius, depth_pixels, tilt, tilts, correlation
@@ -192,7 +60,7 @@ def tilt_planes(
         x, y = points[s]
         height, width = shapes[0]
         correlation[s] = -2.0
-        f, offsets, variance = _template_patch(flat, seen, height, width, int(x), int(y), radius)
+        f, offsets, variance = template_patch(flat, seen, height, width, int(x), int(y), radius)
         if not variance > 0:
             continue
         position = np.empty((images, 2))
@@ -236,7 +104,7 @@ def tilt_planes(
             if total > top:
                 top = total
                 best[:] = trial
-        correlation[s] = _refine(
+        correlation[s] = refine(
             transfers,
             shapes,
             starts,
@@ -295,7 +163,7 @@ def sweep(
         if not (low > 0 and high > low):
             continue
         height, width = shapes[0]
-        f, offsets, variance = _template_patch(flat, seen, height, width, ix, iy, radius)
+        f, offsets, variance = template_patch(flat, seen, height, width, ix, iy, radius)
         if not variance > 0:
             continue
         position = np.empty((images, 2))
@@ -376,7 +244,7 @@ def sweep(
             top = scores[best, column]
             needed = least if only < 0 else pair_least
             if top > needed - lead:
-                top = _refine(
+                top = refine(
                     transfers,
                     shapes,
                     starts,
