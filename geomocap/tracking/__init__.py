@@ -1,1 +1,1 @@
-"""Motion of surfaces: nodes followed on geometry without texture, patches followed in images, and what is made of them."""
+"""Motion of surfaces: nodes followed on geometry without texture, patches followed in images, and their paths."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -91,7 +91,19 @@ class CoarseModel:
         for start in starts:
             found.append(self.fit(frame, start, NEAR, False))
             found.append(self.fit(frame, start, FAR, True))
-        return min(found, key=lambda s: s.cost)
+        best = min(found, key=lambda s: s.cost + self._surprise(s, starts[0]))
+        # where the frame's normals contradict the surface that was found, they may be on the wrong side
+        y, normals = self.graph.deform(best.x, best.R)
+        points = frame.target.points.turned_like(y, normals, 0.5 * self.graph.spacing)
+        if np.array_equal(points.normals, frame.target.points.normals):
+            return best
+        turned = replace(frame, target=replace(frame.target, points=points))
+        return min(best, self.fit(turned, best, NEAR, False), key=lambda s: s.cost)
+
+    def _surprise(self, state: State, expected: State) -> float:
+        """Cost of being elsewhere than expected: two limbs that seem to have changed places have not."""
+        away = np.linalg.norm(state.x - expected.x, axis=1) / (2 * self.graph.spacing)
+        return self.settings.inertia_cost * float((np.minimum(away, 1.0) ** 2).mean())
 
     def expected(self, last: State, before: State) -> State:
         """Go on with the motion of the last frame, made as rigid as can be."""

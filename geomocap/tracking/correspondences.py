@@ -45,22 +45,24 @@ class Target:
     points : PointSet
     feature_scale : (F,) float
         Change of a feature that counts as one scale of distance.
+    normal_weight : float
+        How many scales of distance opposed normals are apart, halved.
     """
 
     points: PointSet
     feature_scale: np.ndarray
+    normal_weight: float = 1.0
 
     def coordinates(self, scale: float) -> np.ndarray:
         """Positions, normals and features in one space in which a scale is worth as much in each (M, 6 + F)."""
         p = self.points
-        return search_coordinates(p.positions, p.normals, p.features, scale, self.feature_scale)
+        return self.search_coordinates(p.positions, p.normals, p.features, scale)
 
-
-def search_coordinates(
-    positions: np.ndarray, normals: np.ndarray, features: np.ndarray, scale: float, feature_scale: np.ndarray
-) -> np.ndarray:
-    """Positions (M, 3), normals and features (M, F) side by side, each scaled to metres."""
-    return np.hstack([positions, scale * normals, scale / np.maximum(feature_scale, 1e-12) * features])
+    def search_coordinates(
+        self, positions: np.ndarray, normals: np.ndarray, features: np.ndarray, scale: float
+    ) -> np.ndarray:
+        """Positions (M, 3), normals and features (M, F) side by side, each scaled to metres."""
+        return np.hstack([positions, scale * self.normal_weight * normals, scale / self.feature_scale * features])
 
 
 def pull(
@@ -90,7 +92,7 @@ def pull(
         Weight of the features' differences, one feature scale for one `scale` of distance.
     """
     points = target.points
-    own = search_coordinates(y, normals, features, scale, target.feature_scale)
+    own = target.search_coordinates(y, normals, features, scale)
     far_out, found = tree.query(own)
     back, taker = cKDTree(own).query(target.coordinates(scale))
     forth_weight = np.exp(-0.5 * (far_out / scale) ** 2)

@@ -38,7 +38,9 @@ def openness(graph: csr_matrix, landmarks: int = 24) -> float:
 
 
 def most_open(values: Sequence[float], frames: Sequence[int], n_frames: int) -> int:
-    """The frame with the greatest openness, those in the middle of the sequence first among near equals.
+    """The frame with the greatest openness among its neighbours in time.
+
+    Near equals are chosen by how near they are to the middle of the sequence, from which no frame is far.
 
     Parameters
     ----------
@@ -49,5 +51,8 @@ def most_open(values: Sequence[float], frames: Sequence[int], n_frames: int) -> 
     n_frames : int
         Length of the sequence.
     """
-    middle = np.abs(np.asarray(frames) - n_frames / 2) / max(n_frames, 1)
-    return int(frames[int(np.argmax(np.asarray(values) * (1 - 0.02 * middle)))])
+    value = np.asarray(values, float)
+    ends = np.concatenate([value[:1], value, value[-1:]])
+    smooth = (ends[:-2] + 2 * value + ends[2:]) / 4
+    away = np.abs(np.asarray(frames) - (n_frames - 1) / 2) / n_frames
+    return int(frames[int(np.argmax(smooth * (1 - 0.1 * away)))])

@@ -20,11 +20,16 @@ class NodeTrackingSettings(Settings):
     stiffness: float = Field(
         0.3, gt=0, description="resistance to bending and stretching, relative to the points' pull"
     )
+    fine_stiffness: float = Field(1.5, gt=0, description="the same for the fine graph")
+    normal_weight: float = Field(1.0, ge=0, description="weight of normals against positions when points are matched")
     give: float = Field(0.3, gt=0, description="strain at which an edge gives way (share of its length)")
     strain_cost: float = Field(1.0, ge=0, description="cost of strain relative to that of unexplained points")
+    inertia_cost: float = Field(
+        0.3, ge=0, description="cost of a motion that doesn't go on, relative to unexplained points"
+    )
     point_weight: float = Field(0.05, ge=0, le=1, description="pull along the surface relative to that across it")
     feature_weight: float = Field(1.0, ge=0, description="pull of features (colours) relative to that of the geometry")
-    feature_scale: float = Field(0.15, gt=0, description="difference of features that separates points")
+    feature_scale: float = Field(0.3, gt=0, description="difference of features that separates points")
     momentum: float = Field(0.9, ge=0, le=1, description="share of the last motion that is expected to go on")
     end_reach: float = Field(0.25, ge=0, description="limbs' ends are looked for within (share of the extent)")
     lost_below: float = Field(

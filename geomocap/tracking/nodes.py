@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -94,6 +94,7 @@ class NodeModel:
         x = (w[..., None] * moved).sum(axis=1)
         R = _nearest_rotations((w[..., None, None] * coarse.R[self.carrier]).sum(axis=1))
         h, s, g = self.graph.spacing, self.settings, self.graph
+        target = replace(target, points=target.points.turned_like(*g.deform(x, R), 0.5 * h))
         for scale, stiffness in FINE:
             c = max(scale * h, 1.5 * self.spacing)
             y, normals = g.deform(x, R)
@@ -101,7 +102,7 @@ class NodeModel:
             found = pull(target, tree, y, normals, g.features, c, s.point_weight, s.feature_weight)
             soft = 1 / (1 + (g.strain(x, R) / s.give) ** 2) ** 2
             share = len(g.samples) / len(g.nodes) / 4
-            x, R = step(g, self.pattern, x, R, stiffness * s.stiffness * share * soft, found.A, found.b, 60)
+            x, R = step(g, self.pattern, x, R, stiffness * s.fine_stiffness * share * soft, found.A, found.b, 60)
         y, normals = g.deform(x, R)
         tree = cKDTree(target.coordinates(c))
         found = pull(target, tree, y, normals, g.features, c, s.point_weight, 0.0)
@@ -153,7 +154,10 @@ def track_nodes(
 
     def prepare(frame: int) -> PointSet:
         more = None if features is None else features(frame)
-        return point_set(points(frame), settings.points, settings.neighbours, settings.seed + frame, more)
+        found = np.asarray(points(frame), float)
+        # dense points are averaged over as much of the surface as few points are
+        neighbours = max(settings.neighbours, min(len(found), 3 * settings.points) * 5 // (2 * settings.nodes))
+        return point_set(found, settings.points, neighbours, settings.seed + frame, more)
 
     frames = list(map_items(prepare, list(range(n_frames)), executor, "points", progress))
     candidates = list(range(0, n_frames, max(1, n_frames // 30)))
@@ -171,7 +175,9 @@ def track_nodes(
         graph = surface_graph(few.positions, few.normals, 8)
         kept = np.flatnonzero(largest_parts(graph, 0.01))
         few, graph = few.at(kept), graph[kept][:, kept]
-        return CoarseTarget(Target(few, scales), few.positions[extremities(graph, END_SIZE * extent)])
+        return CoarseTarget(
+            Target(few, scales, settings.normal_weight), few.positions[extremities(graph, END_SIZE * extent)]
+        )
 
     coarse = list(map_items(coarsen, list(range(n_frames)), executor, "ends of limbs", progress))
     ahead, back = map_items(
@@ -182,7 +188,7 @@ def track_nodes(
         states = mend(model.coarse, coarse, states, reference, way)
 
     def refine(frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return model.refine(Target(frames[frame], scales), states[frame])
+        return model.refine(Target(frames[frame], scales, settings.normal_weight), states[frame])
 
     fine = list(map_items(refine, list(range(n_frames)), executor, "nodes", progress))
     x, R, covariance = (np.stack([f[k] for f in fine], axis=1) for k in range(3))

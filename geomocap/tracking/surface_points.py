@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
@@ -25,19 +25,40 @@ class PointSet:
         What else is known of each point, such as its colour; F may be 0.
     gradients : (M, F, 3) float
         How the features change along the surface, per metre.
+    piece : (M,) int
+        Pieces of the surface within which the normals' side is sure; it is a guess how they stand to each other.
     """
 
     positions: np.ndarray
     normals: np.ndarray
     features: np.ndarray
     gradients: np.ndarray
+    piece: np.ndarray
 
     def __len__(self) -> int:
         return len(self.positions)
 
     def at(self, kept: np.ndarray) -> PointSet:
         """Return the points at some indices."""
-        return PointSet(self.positions[kept], self.normals[kept], self.features[kept], self.gradients[kept])
+        return PointSet(
+            self.positions[kept], self.normals[kept], self.features[kept], self.gradients[kept], self.piece[kept]
+        )
+
+    def turned_like(self, surface: np.ndarray, normals: np.ndarray, scale: float) -> PointSet:
+        """Turn the normals of whole pieces to the side that a known surface near them has.
+
+        Parameters
+        ----------
+        surface, normals : (S, 3) float
+            Samples of the known surface, metres, and their normals.
+        scale : float
+            Distance at which a sample loses its vote, metres.
+        """
+        distance, near = cKDTree(surface).query(self.positions)
+        vote = np.exp(-0.5 * (distance / scale) ** 2)
+        agree = np.bincount(self.piece, vote * (self.normals * normals[near]).sum(axis=1))
+        against = agree < -0.2 * np.bincount(self.piece, vote)
+        return replace(self, normals=np.where(against[self.piece, None], -self.normals, self.normals))
 
     def thinned(self, count: int, seed: int) -> PointSet:
         """Return at most `count` points, drawn at random."""
@@ -75,12 +96,12 @@ def point_set(
         chosen = np.sort(np.random.default_rng(seed).permutation(len(points))[: 3 * n_points])
         points, features = points[chosen], features[chosen]
     near = cKDTree(points).query(points, neighbours + 1)[1]
-    normals = oriented_normals(points, near)
+    normals, piece = oriented_normals(points, near)
     gradients = feature_gradients(points, normals, near, features)
-    return PointSet(points, normals, np.asarray(features, float), gradients).thinned(n_points, seed)
+    return PointSet(points, normals, np.asarray(features, float), gradients, piece).thinned(n_points, seed)
 
 
-def oriented_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:
+def oriented_normals(points: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Normals by principal components, oriented along a minimum spanning tree and then outwards.
 
     Source: H. Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992, sections 3.2 and 3.3.
@@ -90,6 +111,12 @@ def oriented_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:
     points : (M, 3) float, metres
     near : (M, k) int
         Each point's nearest points, itself first.
+
+    Returns
+    -------
+    normals : (M, 3) float
+    piece : (M,) int
+        Parts of the tree between edges over which the surface turns by more than 45°: there the side may be wrong.
     """
     local = points[near] - points[near].mean(axis=1, keepdims=True)
     normals = np.linalg.eigh(np.einsum("mki,mkj->mij", local, local))[1][:, :, 0]
@@ -107,7 +134,10 @@ def oriented_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:
         outward = ((points[members] - points[members].mean(axis=0)) * normals[members]).sum()
         if outward < 0:
             normals[members] *= -1
-    return normals
+    sure = tree.copy()
+    sure.data[sure.data > 1 - np.sqrt(0.5)] = 0
+    sure.eliminate_zeros()
+    return normals, connected_components(sure, directed=False)[1]
 
 
 def _follow(normals: np.ndarray, order: np.ndarray, parent: np.ndarray) -> None:
@@ -144,7 +174,7 @@ def surface_graph(points: np.ndarray, normals: np.ndarray, neighbours: int) -> c
     M = len(points)
     distance, near = cKDTree(points).query(points, neighbours + 1)
     i, j, d = np.repeat(np.arange(M), neighbours), near[:, 1:].ravel(), distance[:, 1:].ravel()
-    reach = 2.0 * np.median(distance[:, -1])
+    reach = 1.25 * np.median(distance[:, -1])
     keep = (d < reach) & ((normals[i] * normals[j]).sum(axis=1) > -0.2)
     graph = coo_matrix((np.maximum(d[keep], 1e-9), (i[keep], j[keep])), (M, M)).tocsr()
     return graph.maximum(graph.T)
