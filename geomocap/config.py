@@ -13,10 +13,14 @@ from geomocap.cloud.settings import CloudSettings
 from geomocap.errors import SettingsError
 from geomocap.export.settings import ExportSettings
 from geomocap.scans import ScanSettings
+from geomocap.segmentation.motion_bodies import MotionBodiesSettings
 from geomocap.segmentation.settings import SegmentationSettings
 from geomocap.settings import Settings, check_settings
 from geomocap.silhouettes import SilhouetteSettings
+from geomocap.skeleton.motion_skeleton import MotionSkeletonSettings
 from geomocap.skeleton.settings import SkeletonSettings
+from geomocap.tracking.node_settings import NodeTrackingSettings
+from geomocap.tracking.tracking_settings import TrackingSettings
 
 
 class Config(Settings):
@@ -28,6 +32,10 @@ class Config(Settings):
     scans: ScanSettings = Field(ScanSettings(), description="reading of scans")
     segmentation: SegmentationSettings = Field(SegmentationSettings(), description="bodies")
     skeleton: SkeletonSettings = Field(SkeletonSettings(), description="joints and hierarchy")
+    tracking: TrackingSettings = Field(TrackingSettings(), description="surface tracking in the images")
+    nodes: NodeTrackingSettings = Field(NodeTrackingSettings(), description="node tracking on the geometry")
+    motion_bodies: MotionBodiesSettings = Field(MotionBodiesSettings(), description="bodies from motion paths")
+    motion_skeleton: MotionSkeletonSettings = Field(MotionSkeletonSettings(), description="their joints")
     export: ExportSettings = Field(ExportSettings(), description="motion files")
 
 

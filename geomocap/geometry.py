@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import open3d as o3d
@@ -11,6 +13,26 @@ import open3d as o3d
 from geomocap.errors import GeometryError
 from geomocap.files import write_atomic
 from geomocap.palette import body_colors
+
+
+class Geometry(Protocol):
+    """A sequence of point sets, wherever they come from."""
+
+    @property
+    def spacing(self) -> float:
+        """Distance of neighbouring points, metres."""
+        ...
+
+    @property
+    def features(self) -> Callable[[int], np.ndarray] | None:
+        """`features(frame) -> (N, F)`: what else is known of the points, such as colours from 0 to 1; None: nothing."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def points(self, frame: int) -> np.ndarray:
+        """Points of one frame, (N, 3) float, metres, world."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,8 @@ class Scans:
     read: Callable[[int], np.ndarray]
     settings: ScanSettings
 
+    features = None
+
     def __len__(self) -> int:
         return len(self.names)
 

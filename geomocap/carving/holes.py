@@ -80,9 +80,8 @@ def enclosed_holes(mask: np.ndarray, least: int = 6) -> list[tuple[np.ndarray, n
     """
     h, w = mask.shape
     count, labels, stats, _ = cv2.connectedComponentsWithStats((mask == 0).view(np.uint8), connectivity=4)
-    holes = []
-    order = np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable") + 1 if count > 1 else []
-    for k in order:
+    holes: list[tuple[np.ndarray, np.ndarray]] = []
+    for k in np.argsort(-stats[1:count, cv2.CC_STAT_AREA], kind="stable") + 1:
         x, y, dx, dy, area = stats[k]
         if x == 0 or y == 0 or x + dx == w or y + dy == h:
             continue  # open to the border of the image

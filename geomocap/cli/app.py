@@ -51,6 +51,7 @@ def options(
 
 
 Fps = Annotated[float, typer.Option("--fps", min=0.001, help="Scans per second.")]
+BODIES = ("segmentation", "skeleton", "nodes", "motion_bodies", "motion_skeleton")
 Pictures = Annotated[bool, typer.Option(help="Make review pictures and the report.")]
 
 
@@ -85,7 +86,17 @@ def cloud(
 
 
 @app.command()
-@with_settings("scans", "segmentation", "skeleton", "export")
+@with_settings("silhouettes", "carving", "tracking")
+def track(
+    capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
+) -> None:
+    """Follow points of the surface through all frames: trajectories with velocities and accelerations."""
+    with capture_job(capture, run, config, workers, scheduler) as job:
+        pipeline.tracks(job)
+
+
+@app.command()
+@with_settings("scans", *BODIES, "export")
 def segment(
     scans: Annotated[
         Path, typer.Argument(metavar="SCANS", help="Folder of scans, or one file (PLY PCD OBJ STL GLB NPZ).")
@@ -106,7 +117,7 @@ def segment(
 
 
 @app.command()
-@with_settings("silhouettes", "carving", "cloud", "segmentation", "skeleton", "export")
+@with_settings("silhouettes", "carving", "cloud", "tracking", *BODIES, "export")
 def run(
     capture: CaptureFolder,
     run: RunFolder,
@@ -155,6 +166,7 @@ app.command()(captures.synthesize)
 app.command("import")(captures.import_)
 app.command()(captures.demo)
 app.command()(calibrate)
+app.command("convert-calibration")(captures.convert)
 app.command()(export)
 app.command()(evaluate)
 app.command()(info)

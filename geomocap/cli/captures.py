@@ -12,6 +12,7 @@ from data_tools.asset import AnimatedAsset
 from data_tools.figure import figure, mechanism
 from data_tools.gltf import load_gltf
 from data_tools.importing import SizeMismatch, import_colmap, import_pose2sim
+from data_tools.importing_calibrations import Format, convert_calibration, import_calibration
 from data_tools.synthesize import SynthesisSettings
 from data_tools.synthesize import synthesize as synthesize_capture
 from geomocap import pipeline
@@ -56,13 +57,18 @@ def synthesize(
 
 
 def import_(
-    kind: Annotated[Literal["pose2sim", "colmap"], typer.Argument(metavar="KIND", help="pose2sim or colmap.")],
-    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="The other tool's folder.")],
+    kind: Annotated[
+        Literal["pose2sim", "colmap", "anipose", "caliscope", "opencv", "easymocap", "qualisys"],
+        typer.Argument(metavar="KIND", help="pose2sim, colmap, anipose, caliscope, opencv, easymocap or qualisys."),
+    ],
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="The other tool's folder, or its calibration.")],
     capture: CaptureFolder,
-    fps: Annotated[float, typer.Option("--fps", min=0.001, help="colmap: frames per second.")] = 30.0,
-    up: Annotated[Literal["x", "y", "z"], typer.Option("--up", help="colmap: world axis that points up.")] = "z",
+    fps: Annotated[float, typer.Option("--fps", min=0.001, help="Frames per second, where SOURCE doesn't say.")] = 30.0,
+    up: Annotated[
+        Literal["x", "y", "z"], typer.Option("--up", help="World axis that points up, where SOURCE doesn't say.")
+    ] = "z",
     metres_per_unit: Annotated[
-        float, typer.Option("--metres-per-unit", min=1e-9, help="colmap: metres in a unit of the model.")
+        float, typer.Option("--metres-per-unit", min=1e-9, help="Metres in a unit of the calibration.")
     ] = 1.0,
     size_mismatch: Annotated[
         SizeMismatch, typer.Option("--size-mismatch", help="pose2sim: how images came to another size than calibrated.")
@@ -71,8 +77,17 @@ def import_(
     """Turn another tool's session into a capture.
 
     pose2sim: a session folder with calibration/ (Qualisys or Pose2Sim TOML) and videos/.
-    colmap: a folder with sparse/ and images/<camera>/.
+    colmap: a folder with sparse/ and images/CAMERA/.
+
+    The others are calibrations alone: they are put into CAPTURE, whose images/CAMERA/ or videos/CAMERA.mp4 bear their
+    cameras' names.
     """
+    if kind not in ("pose2sim", "colmap"):
+        rig, notes = import_calibration(source, capture, fps, metres_per_unit=metres_per_unit, up=up)
+        for note in notes:
+            console.print(f"note: {note}")
+        console.print(f"{capture / 'sparse'}: {len(rig)} cameras")
+        return
     with progress_bars() as progress:
         if kind == "pose2sim":
             report = import_pose2sim(source, capture, size_mismatch=size_mismatch, progress=progress)
@@ -82,6 +97,21 @@ def import_(
         console.print(f"note: {note}")
     opened = report.capture
     console.print(f"{capture}: {len(opened.cameras)} cameras, {opened.n_frames} frames at {opened.fps:g} fps")
+
+
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Calibration of any known format.")],
+    target: Annotated[
+        Path, typer.Argument(metavar="TARGET", help="File to write; folder for OpenCV, EasyMocap, COLMAP.")
+    ],
+    kind: Annotated[Format, typer.Option("--format", help="Format to write.")],
+    metres_per_unit: Annotated[
+        float, typer.Option("--metres-per-unit", min=1e-9, help="Metres in a unit of the calibration.")
+    ] = 1.0,
+) -> None:
+    """Convert a calibration between the formats of aniposelib, caliscope, Pose2Sim, OpenCV, EasyMocap and COLMAP."""
+    rig = convert_calibration(source, target, kind, metres_per_unit=metres_per_unit)
+    console.print(f"{target}: {len(rig)} cameras")
 
 
 def demo(

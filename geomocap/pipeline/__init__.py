@@ -5,6 +5,7 @@ from geomocap.pipeline.export import motion_files
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.segmentation import segment
 from geomocap.pipeline.silhouettes import silhouettes
+from geomocap.pipeline.tracks import tracks
 from geomocap.pipeline.voxels import voxels
 
-__all__ = ["Job", "clouds", "motion_files", "segment", "silhouettes", "voxels"]
+__all__ = ["Job", "clouds", "motion_files", "segment", "silhouettes", "tracks", "voxels"]

@@ -5,7 +5,8 @@ from __future__ import annotations
 from geomocap.export.run_export import FILES, export_run
 from geomocap.files import fingerprint
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.segmentation import Source, segment
+from geomocap.pipeline.segmentation import segment
+from geomocap.pipeline.sources import Source
 from geomocap.run import stage_key
 
 

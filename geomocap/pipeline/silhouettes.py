@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -88,11 +90,8 @@ class _Cut:
         masks = [self.cut(camera, frame) for camera in self.capture.cameras]
         if self.undistortion is not None:
             masks = fill_false_holes(self.capture.rig, self.undistortion.views(masks), masks)
-        parameters = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
         for camera, mask in zip(self.capture.cameras, masks, strict=True):
-            write_atomic(
-                self.run.silhouette_file(camera, frame), lambda p, mask=mask: cv2.imwrite(str(p), mask, parameters)
-            )
+            write_atomic(self.run.silhouette_file(camera, frame), partial(_write_mask, mask))
 
     def cut(self, camera: str, frame: int) -> np.ndarray:
         """Silhouette of one image, (H, W) uint8, 0 or 255."""
@@ -100,6 +99,12 @@ class _Cut:
             return self.capture.mask(camera, frame)
         image = self.capture.frame(camera, frame)
         return silhouette(image, self.models[camera], self.settings, self.regions.get(camera))
+
+
+def _write_mask(mask: np.ndarray, path: Path) -> bool:
+    """Write a silhouette as a PNG that is made for speed."""
+    parameters = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+    return cv2.imwrite(str(path), mask, parameters)
 
 
 def _regions(capture: Capture) -> dict[str, np.ndarray]:

@@ -12,8 +12,9 @@ from geomocap.settings import Settings
 class SegmentationSettings(Settings):
     """How points are divided into ellipsoids and these into rigid bodies."""
 
-    method: Literal["m3"] = Field(
-        default="m3", description="m3: split, merge, match and compare paths, as in the paper"
+    method: Literal["motion", "m3"] = Field(
+        default="motion",
+        description="motion: bodies from how the tracked surface turns; m3: the paper's split, merge, match and paths",
     )
     max_depth: int = Field(
         default=7, ge=1, le=10, description="levels of splitting; at most 2^levels ellipsoids a frame"

@@ -107,11 +107,21 @@ def test_given_masks_are_used_as_they_are(capture, small_capture, geomocap, tmp_
         np.testing.assert_array_equal(made, cv2.imread(str(file), cv2.IMREAD_GRAYSCALE))
 
 
-def test_scans_are_segmented_like_voxels(finished, geomocap, tmp_path):
-    geomocap("segment", finished / "voxels", tmp_path / "run", "--fps", 10, "--no-pictures")
-    ours, other = np.load(tmp_path / "run/ellipsoids.npz"), np.load(finished / "ellipsoids.npz")
+def test_scans_are_segmented_like_voxels(finished, small_capture, geomocap, tmp_path):
+    m3 = ["--segmentation.method", "m3", "--no-pictures"]
+    geomocap("run", small_capture, tmp_path / "voxels", *SETTINGS, *m3)
+    geomocap("segment", finished / "voxels", tmp_path / "scans", "--fps", 10, *m3)
+    ours, other = np.load(tmp_path / "scans/ellipsoids.npz"), np.load(tmp_path / "voxels/ellipsoids.npz")
     np.testing.assert_allclose(ours["centers"], other["centers"], atol=1e-9)
     np.testing.assert_array_equal(ours["body"], other["body"])
+
+
+def test_scans_without_colours_or_cameras_get_bodies_by_motion(finished, geomocap, tmp_path):
+    geomocap("segment", finished / "voxels", tmp_path / "run", "--fps", 10, "--no-pictures")
+    skeleton = np.load(tmp_path / "run/skeleton.npz")
+    assert len(skeleton["joint_names"]) >= 2
+    labels = BodyPoints.read(tmp_path / "run/bodies/000003.ply").body
+    assert len(np.unique(labels)) == skeleton["body_rotations"].shape[1]
 
 
 def test_single_scan_gets_its_ellipsoids(finished, geomocap, tmp_path):

@@ -1,0 +1,101 @@
+"""Method "motion": bodies and joints from motion paths, of images where they show texture, else of the geometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geomocap.errors import GeometryError
+from geomocap.geometry import BodyPoints, Geometry
+from geomocap.pipeline.job import Job
+from geomocap.run import Run
+from geomocap.scheduling import map_items
+from geomocap.segmentation.ellipsoids import Ellipsoids, fit_ellipsoids
+from geomocap.segmentation.motion_bodies import MotionBodies, find_motion_bodies
+from geomocap.segmentation.motion_labels import label_points
+from geomocap.segmentation.motion_paths import MotionPaths
+from geomocap.skeleton.motion_skeleton import find_motion_skeleton
+from geomocap.tracking.nodes import track_nodes
+from geomocap.tracking.selection import spread_out
+
+SAMPLES = 1500  # motion paths that bodies are found from
+LEAST_SAMPLES = 300  # fewer long trajectories than these don't cover a subject: nodes are tracked instead
+LEAST_COVERAGE = 0.4  # nor do trajectories that are measured, on average, in a smaller share of the frames
+
+
+def segment_by_motion(job: Job, geometry: Geometry) -> int:
+    """Find bodies and skeleton from motion paths, write them, and return the number of frames."""
+    frames = len(geometry)
+    paths, source = _paths(job, geometry)
+    job.progress("bodies", 0, 1)
+    bodies = find_motion_bodies(paths, job.config.motion_bodies)
+    job.progress("bodies", 1, 1)
+    with job.run.timed("skeleton") as count:
+        found = find_motion_skeleton(bodies, job.fps, job.config.motion_skeleton)
+        count["items"] = frames
+    label = _Label(geometry, job.run, bodies, paths)
+    fitted = list(map_items(label, range(frames), job.executor, "labels", job.progress))
+    together = {
+        name: np.stack([getattr(e, name) for e in fitted])
+        for name in ("centers", "radii", "rotations", "counts", "errors")
+    }
+    job.run.write_npz("ellipsoids.npz", **together, body=np.arange(bodies.body_count, dtype=np.int32))
+    job.run.write_npz("skeleton.npz", **found.skeleton.arrays())
+    job.run.write_npz(
+        "diagnostics.npz",
+        paths=np.array(source),
+        sample_positions=bodies.positions,
+        sample_body=bodies.label,
+        sample_residuals=bodies.residuals,
+        reliability=bodies.reliability,
+        joint_costs=found.costs,
+        joint_is_hinge=np.array([joint.hinge for joint in found.joints], dtype=bool),
+        joint_axes=np.array([joint.axis for joint in found.joints]).reshape(-1, 3),
+        joint_std=np.array([joint.std for joint in found.joints]).reshape(-1, 3),
+        curve_bodies=np.array([step.bodies for step in bodies.curve]),
+        curve_strengths=np.array([step.strength for step in bodies.curve]),
+    )
+    return frames
+
+
+def _paths(job: Job, geometry: Geometry) -> tuple[MotionPaths, str]:
+    """Motion paths from the best source that there is."""
+    if (job.run.path / "tracks.npz").exists():
+        tracked = job.run.read_npz("tracks.npz")
+        chosen = spread_out(tracked["positions"], SAMPLES)
+        positions = tracked["positions"][chosen]
+        coverage = float(np.isfinite(positions[:, :, 0]).mean()) if len(chosen) else 0.0
+        if len(chosen) >= LEAST_SAMPLES and coverage >= LEAST_COVERAGE:
+            return MotionPaths(positions, sigma=_filled(tracked["sigma"][chosen])), "patches"
+    nodes = track_nodes(geometry.points, len(geometry), job.config.nodes, geometry.features, job.progress, job.executor)
+    followed = np.isfinite(nodes.positions).all(axis=2).any(axis=1)
+    if not followed.any():
+        raise GeometryError("no node of the surface could be followed; are the frames one subject in motion?")
+    return (
+        MotionPaths(
+            nodes.positions[followed], sigma=_filled(nodes.sigma[followed]), reference=nodes.reference[followed]
+        ),
+        "nodes",
+    )
+
+
+def _filled(sigma: np.ndarray) -> np.ndarray:
+    """Standard deviations with the median where a sample was not seen."""
+    return np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma))
+
+
+@dataclass(frozen=True)
+class _Label:
+    """Bodies of the points of one frame, written to the run, and an ellipsoid for each."""
+
+    geometry: Geometry
+    run: Run
+    bodies: MotionBodies
+    paths: MotionPaths
+
+    def __call__(self, frame: int) -> Ellipsoids:
+        points = self.geometry.points(frame)
+        label = label_points(self.bodies, self.paths, frame, points)
+        BodyPoints(points, label).write(self.run.frame_file("bodies", frame))
+        return fit_ellipsoids(points, label, self.bodies.body_count, self.geometry.spacing)

@@ -1,0 +1,76 @@
+"""Where the geometry of a run comes from: surface voxels, measured clouds, or anybody's scans."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from geomocap.errors import GeometryError
+from geomocap.geometry import Geometry, Voxels, read_cloud
+from geomocap.pipeline.clouds import clouds
+from geomocap.pipeline.job import Job
+from geomocap.pipeline.voxels import voxels
+from geomocap.run import Run, stage_key
+from geomocap.scans import point_spacing
+
+Source = Literal["voxels", "cloud", "scans"]
+
+
+@dataclass(frozen=True)
+class VoxelFrames:
+    """The surface voxels of a run."""
+
+    run: Run
+    frames: int
+
+    @property
+    def spacing(self) -> float:
+        """Edge of a voxel, metres."""
+        return Voxels.read(self.run.frame_file("voxels", 0)).voxel_size
+
+    def __len__(self) -> int:
+        return self.frames
+
+    def points(self, frame: int) -> np.ndarray:
+        """Voxel centres of one frame, (N, 3) float, metres, world."""
+        return Voxels.read(self.run.frame_file("voxels", frame)).points
+
+    def features(self, frame: int) -> np.ndarray:
+        """Colours of the voxels, (N, 3) float, 0 to 1."""
+        return Voxels.read(self.run.frame_file("voxels", frame)).colors / 255.0
+
+
+@dataclass(frozen=True)
+class CloudFrames:
+    """The measured surface points of a run."""
+
+    run: Run
+    frames: int
+
+    @property
+    def spacing(self) -> float:
+        """Mean distance of a point of the first cloud from its nearest neighbour, metres."""
+        return point_spacing(self.points(0))
+
+    def __len__(self) -> int:
+        return self.frames
+
+    def points(self, frame: int) -> np.ndarray:
+        """Points of one frame, (N, 3) float, metres, world."""
+        return read_cloud(self.run.frame_file("cloud", frame))
+
+    features = None
+
+
+def geometry_of(job: Job, source: Source) -> tuple[Geometry, str]:
+    """Make the geometry that a source names, and return it with the key of the stage that made it."""
+    if source == "scans":
+        if job.scans is None:
+            raise GeometryError("no scans were given")
+        return job.scans, stage_key("scans", job.scans.fingerprint(), job.config.scans.model_dump())
+    key = voxels(job) if source == "voxels" else clouds(job)
+    assert job.capture is not None
+    frames = job.capture.n_frames
+    return VoxelFrames(job.run, frames) if source == "voxels" else CloudFrames(job.run, frames), key

@@ -1,0 +1,74 @@
+"""Stage: images and volumes → trajectories of surface points, `tracks.npz`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from geomocap.capture import Capture, read_image
+from geomocap.carving.views import Undistortion
+from geomocap.errors import CaptureError
+from geomocap.geometry import Voxels
+from geomocap.pipeline.job import Job
+from geomocap.pipeline.voxels import voxels
+from geomocap.run import Run, stage_key
+from geomocap.tracking.filters import filter_trajectories
+from geomocap.tracking.frame_views import FrameViews
+from geomocap.tracking.patch_tracking import track_surface
+from geomocap.tracking.smoothing import smooth_motion
+from geomocap.tracking.tracking_settings import TrackingSettings
+from geomocap.tracking.trajectories import REASONS
+
+
+def tracks(job: Job) -> str:
+    """Follow the surface through all frames, voxels first if need be, and return the stage's key."""
+    capture = job.capture
+    if capture is None:
+        raise CaptureError("tracks need a capture")
+    pictures = capture.fingerprint("images", "videos", "sparse")
+    key = stage_key("tracks", voxels(job), pictures, job.config.tracking.model_dump(), job.fps)
+    return job.stage("tracks", key, ["tracks.npz"], lambda: _track(job, capture))
+
+
+def _track(job: Job, capture: Capture) -> int:
+    read = _ReadFrame(capture, job.run, job.config.tracking, Undistortion.of(capture.rig))
+    found = track_surface(read, capture.n_frames, job.config.tracking, job.progress, job.executor)
+    motion = smooth_motion(found.positions, job.fps, found.sigma)
+    filtered = filter_trajectories(found, motion)
+    kept = filtered.trajectories
+    motion = smooth_motion(kept.positions, job.fps, kept.sigma)
+    job.run.write_npz(
+        "tracks.npz",
+        positions=kept.positions,
+        velocities=motion.velocities,
+        accelerations=motion.accelerations,
+        start=kept.start,
+        end=kept.end,
+        sigma=kept.sigma,
+        correlation=kept.correlation,
+        n_views=kept.n_views,
+        velocity_std=motion.velocity_std,
+        acceleration_std=motion.acceleration_std,
+        normals=kept.normals,
+        placed=kept.placed,
+        begin_reason=kept.begin_reason,
+        end_reason=kept.end_reason,
+        reasons=list(REASONS),
+    )
+    return capture.n_frames
+
+
+@dataclass(frozen=True)
+class _ReadFrame:
+    """Images, silhouettes and voxels of a frame as tracking wants them."""
+
+    capture: Capture
+    run: Run
+    settings: TrackingSettings
+    undistortion: Undistortion
+
+    def __call__(self, frame: int) -> FrameViews:
+        cameras = self.capture.cameras
+        images = self.undistortion.images([self.capture.frame(c, frame) for c in cameras])
+        masks = [read_image(self.run.silhouette_file(c, frame), gray=True) for c in cameras]
+        voxels = Voxels.read(self.run.frame_file("voxels", frame))
+        return FrameViews.of(self.undistortion.views(masks), images, voxels, self.settings.blurs_px)
