@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from geomocap.errors import GeometryError
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads
+from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.tracking.coarse_motion import CoarseModel, CoarseTarget, State, follow, mend
 from geomocap.tracking.correspondences import Target, pull
 from geomocap.tracking.deformation import block_pattern, step
@@ -61,6 +62,11 @@ class NodeTracks:
     def sigma(self) -> np.ndarray:
         """Standard deviation of a coordinate, root mean square of the three directions, (N, T) float, metres."""
         return np.sqrt(np.trace(self.covariance, axis1=2, axis2=3) / 3)
+
+    def motion_paths(self) -> MotionPaths:
+        """Return the nodes as motion paths, those that are never seen left out."""
+        seen = np.isfinite(self.positions[..., 0]).any(axis=1)
+        return MotionPaths(self.positions[seen], self.rotations[seen], self.sigma[seen], self.reference[seen])
 
 
 class NodeModel:

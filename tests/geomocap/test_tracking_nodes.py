@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from geomocap.errors import GeometryError
 from geomocap.tracking.correspondences import Target, gather_pulls, pull
 from geomocap.tracking.deformation import block_pattern, normal_equations, rotation_of, solve_blocks, step, vector_of
 from geomocap.tracking.extremities import extremities, match_ends
+from geomocap.tracking.keyframes import most_open, openness
 from geomocap.tracking.node_graph import farthest_points, node_graph
 from geomocap.tracking.node_settings import NodeTrackingSettings
 from geomocap.tracking.nodes import track_nodes
@@ -240,6 +242,22 @@ def test_bending_arm(bending):
         assert np.percentile(np.rad2deg(angle), 90) < 12
 
 
+def test_openness_prefers_stretched_limbs():
+    straight, folded = (point_set(bend(capsule(1200), a), 1200, 9) for a in (0.0, 2.8))
+    open_, closed = (openness(surface_graph(s.positions, s.normals, 8)) for s in (straight, folded))
+    assert closed < open_
+    assert most_open([1.0, 1.0, 1.0, 2.0, 2.0, 2.0, 1.0], list(range(7)), 7) == 4
+    # near equals: the one next to the middle
+    assert most_open([1.0] * 9, list(range(9)), 9) == 4
+
+
+def test_normals_on_the_wrong_side_are_turned():
+    s = point_set(capsule(1000), 1000, 9)
+    wrong = replace(s, normals=-s.normals)
+    np.testing.assert_array_equal(wrong.turned_like(s.positions, s.normals, 0.05).normals, s.normals)
+    np.testing.assert_array_equal(s.turned_like(s.positions, s.normals, 0.05).normals, s.normals)
+
+
 def unbend(p: np.ndarray, angle: float) -> np.ndarray:
     """Undo `bend`, by search along the straight arm's coordinates."""
     dense = capsule(60000, seed=99)
@@ -253,6 +271,15 @@ def test_a_limb_is_free_to_slide_along_itself(bending):
     covariance = np.nanmean(tracks.covariance[middle], axis=(0, 1))
     # that half of the arm does not move: its axis is x, and across it the surface is held
     assert covariance[0, 0] > 4 * max(covariance[1, 1], covariance[2, 2])
+
+
+def test_motion_paths_of_nodes(bending):
+    _, tracks = bending
+    paths = tracks.motion_paths()
+    assert paths.count == 150
+    assert paths.rotations is not None
+    np.testing.assert_array_equal(paths.reference, tracks.reference)
+    assert np.isfinite(tracks.sigma).all()
 
 
 def test_the_same_again_with_other_threads(bending):
