@@ -15,6 +15,8 @@ _HULL_SLACK = 3.0  # voxels that a seed may lie behind the drawn surface
 _REGULAR = 1e-12
 _ROUNDS = 3
 _PACKING = 0.7  # points placed at random at least r apart, as many as fit: 0.7 a square of r
+_PEAK_PX = 3.0  # half the width of a peak of correlation along the ray, pixels
+_CLEAR = 0.05  # correlation by which it must exceed all others
 _SWEEP_PX = 1.0  # step of the search along the viewing ray, pixels
 
 
@@ -174,15 +176,18 @@ def _lock(
     others[rows, reference] = False
     ray = patches.positions - view.centers[reference]
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    best = np.full(N, -2.0)
-    start = patches.positions.copy()
     step = _SWEEP_PX * float(np.median(patches.size)) if N else 1.0
-    for shift in np.arange(-settings.search_front, settings.search_depth + step, step):
+    shifts = np.arange(-settings.search_front, settings.search_depth + step, step)
+    scores = np.empty((N, len(shifts)))
+    for j, shift in enumerate(shifts):
         moved = patches.positions + shift * ray
-        found = align(shared, every, moved, patches.frames, others, view, iterations=(-1, 0), least_correlation=0.0)
-        better = found.correlation > best + 1e-3
-        best = np.where(better, found.correlation, best)
-        start[better] = moved[better]
+        tried = align(shared, every, moved, patches.frames, others, view, iterations=(-1, 0), least_correlation=0.0)
+        scores[:, j] = tried.correlation
+    peak = scores.argmax(axis=1)
+    start = patches.positions + shifts[peak][:, None] * ray
+    # another place that fits nearly as well leaves it open which one is true
+    elsewhere = np.abs(np.arange(len(shifts)) - peak[:, None]) > _PEAK_PX / _SWEEP_PX
+    clear = scores[rows, peak] - np.where(elsewhere, scores, -1.0).max(axis=1) > _CLEAR
     found = align(
         shared,
         every,
@@ -198,6 +203,7 @@ def _lock(
     agree = others & (found.by_camera >= settings.camera_correlation)
     mean = np.where(agree, found.by_camera, 0).sum(axis=1) / np.maximum(agree.sum(axis=1), 1)
     keep = (agree.sum(axis=1) >= settings.n_views - 1) & (mean >= settings.seed_correlation)
+    keep &= clear & (np.linalg.norm(found.positions - start, axis=1) < _PEAK_PX * patches.size)
     keep &= (found.sigma < settings.sigma_px * patches.size) & view.may_be_subject(found.positions)
     agree[rows, reference] = True
     patches = patches.moved(found.positions, found.frames).select(keep)

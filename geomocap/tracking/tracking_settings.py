@@ -10,17 +10,17 @@ from geomocap.settings import Settings
 class TrackingSettings(Settings):
     """How patches of the surface are placed and followed."""
 
-    n_patches: int = Field(1500, ge=10, le=100_000, description="Patches wanted on the surface at any time")
+    n_patches: int = Field(1500, ge=10, le=100_000, description="Patches placed on a frame's whole surface")
     radius_px: int = Field(5, ge=2, le=20, description="Half the width of a patch (pixels)")
     blurs_px: tuple[float, float] = Field((2.5, 0.8), description="Blur of the coarse and the fine level (pixels)")
     seed_every: int = Field(10, ge=1, description="Frames between two looks for surface without patches")
     seed_correlation: float = Field(0.85, gt=0, lt=1, description="Least correlation between cameras for a new patch")
     search_front: float = Field(0.015, ge=0, description="How far before the surface a new patch is looked for (m)")
     search_depth: float = Field(0.06, ge=0, description="How far behind the surface a new patch is looked for (m)")
-    correlation: float = Field(0.8, gt=0, lt=1, description="Least mean correlation of a tracked patch")
+    correlation: float = Field(0.85, gt=0, lt=1, description="Least mean correlation of a tracked patch")
     camera_correlation: float = Field(0.6, gt=0, lt=1, description="Least correlation for a camera to count")
     n_views: int = Field(2, ge=1, description="Least number of cameras that see a tracked patch")
-    sigma_px: float = Field(0.35, gt=0, description="Largest standard deviation of a position (pixels on the patch)")
+    sigma_px: float = Field(0.2, gt=0, description="Largest standard deviation of a position (pixels on the patch)")
     slack_px: float = Field(8.0, gt=0, description="Depth, beyond two voxels, of what hides a patch (pixels on it)")
     neighbour_px: float = Field(3.0, gt=0, description="Largest distance from where neighbours' motion puts it (px)")
     longest_gap: int = Field(8, ge=0, description="Frames that a lost patch is carried along by its neighbours")

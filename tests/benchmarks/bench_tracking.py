@@ -18,7 +18,7 @@ from tests.benchmarks.table import Row
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
 
 FRAMES = 8
-SCENE = MovingEllipsoid(n_cameras=8, width=640, height=480, focal=900.0)
+SCENE = MovingEllipsoid(n_cameras=8, width=640, height=480, focal=900.0, texture=150.0)
 SETTINGS = TrackingSettings(n_patches=2000, seed_every=100)
 
 

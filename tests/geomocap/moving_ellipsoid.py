@@ -26,6 +26,7 @@ class MovingEllipsoid:
     width: int = 160
     height: int = 120
     focal: float = 260.0
+    texture: float = 60.0  # waves a metre × 2π
 
     def pose(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Return rotation (3, 3) and translation (3,) of a frame."""
@@ -48,7 +49,7 @@ class MovingEllipsoid:
     def grey(self, body: np.ndarray) -> np.ndarray:
         """Grey level of the solid texture at body points (…, 3)."""
         rng = np.random.default_rng(3)
-        waves, phases = rng.normal(0, 60, (40, 3)), rng.uniform(0, 2 * np.pi, 40)
+        waves, phases = rng.normal(0, self.texture, (40, 3)), rng.uniform(0, 2 * np.pi, 40)
         return 128 + 60 * np.sin(body @ waves.T + phases).sum(axis=-1) / np.sqrt(20)
 
     def images(self, frame: int) -> tuple[np.ndarray, np.ndarray]:

@@ -49,6 +49,11 @@ def test_frame_views_have_depth_in_front_of_the_surface_and_no_background(scene,
     assert abs(view.levels[0][rim].mean() - view.levels[0][inside].mean()) < 8
 
 
+def test_points_outside_a_silhouette_are_not_the_subject(views):
+    points = np.array([[0.0, 0, 0], [0.19, 0, 0], [0.3, 0, 0], [0, 0, -50.0]])
+    assert views[0].may_be_subject(points).tolist() == [True, True, False, True]  # the last one nobody sees
+
+
 def test_frame_views_refuse_images_of_another_size(scene):
     images, masks = scene.images(0)
     views = PinholeViews.of(scene.projections(), masks)
