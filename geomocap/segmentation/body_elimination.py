@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geomocap.segmentation.body_model import BodyModel, Evidence, reassign, refit
+from geomocap.segmentation.body_model import BodyModel, Evidence, reassign, refit, settle_rest
 from geomocap.segmentation.rigid_motions import relative_turn
 
 _MOST_SAMPLES = 80
@@ -15,6 +15,8 @@ _CORE = 0.4
 _CLEARLY = np.deg2rad(40.0)
 _TIP_QUANTILE = 0.8
 _TURN_SHARE = 0.02
+_LEAST_SEEN = 0.1
+_LEAST_FRAMES = 5
 
 
 @dataclass(frozen=True)
@@ -79,12 +81,14 @@ class EliminationStep:
 
 def eliminate(
     model: BodyModel, evidence: Evidence, criterion: Criterion, count: int | None
-) -> tuple[BodyModel, list[EliminationStep]]:
+) -> tuple[BodyModel, Evidence, list[EliminationStep]]:
     """Take away the weakest body until all are strong enough, or until a given number is left.
 
     Returns
     -------
     BodyModel
+    Evidence
+        With places in the reference settled anew.
     list of EliminationStep
         The curve; its last step is the one that was not taken.
     """
@@ -98,9 +102,9 @@ def eliminate(
         curve.append(EliminationStep(len(bodies), weakest.strength, turn_deg, excess_deg))
         enough = weakest.strength >= 1.0 if count is None else len(bodies) <= count
         if enough or len(bodies) == 1 or not np.isfinite(weakest.strength):
-            return model.compact(), curve
+            return model.compact(), evidence, curve
         before = model
-        model = remove(weakest, model, evidence)
+        model, evidence = remove(weakest, model, evidence)
         for stale in _changed(before, model, evidence):
             known.pop(stale, None)
 
@@ -117,7 +121,6 @@ def _changed(before: BodyModel, after: BodyModel, evidence: Evidence) -> list[in
 
 def judge(body: int, model: BodyModel, evidence: Evidence, criterion: Criterion) -> Candidate:
     """What speaks for a body: how far it turns against its neighbours, and how badly these explain it."""
-    contacts = model.contacts(evidence.adjacency)[body]
     neighbours = np.flatnonzero(model.adjacent(evidence.adjacency)[body])
     members = np.flatnonzero(model.label == body)
     if not len(neighbours) or not len(members):
@@ -128,7 +131,10 @@ def judge(body: int, model: BodyModel, evidence: Evidence, criterion: Criterion)
     radius = min(float(np.sqrt(((rest - rest.mean(axis=0)) ** 2).sum(axis=1).mean())), criterion.largest_radius)
     if len(members) > _MOST_SAMPLES:
         members = members[np.linspace(0, len(members) - 1, _MOST_SAMPLES).astype(int)]
-    others = neighbours[np.argsort(-contacts[neighbours], kind="stable")[:_MOST_NEIGHBOURS]]
+    reached = np.bincount(model.label[evidence.near[members].indices], minlength=model.count)
+    reached[body] = 0
+    reached[neighbours] += len(model.label)  # those that touch come first
+    others = np.argsort(-reached, kind="stable")[: min(_MOST_NEIGHBOURS, int((reached > 0).sum()))]
     any_pair = np.ones((model.count, model.count), bool)
     without = np.zeros((len(members), model.count), bool)
     without[:, others] = True
@@ -146,7 +152,15 @@ def judge(body: int, model: BodyModel, evidence: Evidence, criterion: Criterion)
 
 def _turn(first: int, second: int, model: BodyModel, evidence: Evidence) -> float:
     """Turn of two bodies against each other: mean of that of their motions and of their most different parts."""
-    turn = relative_turn(model.rotations[first], model.rotations[second], _TURN_SHARE)
+    known = _seen(first, model, evidence) & _seen(second, model, evidence)
+    if known.sum() < min(_LEAST_FRAMES, len(known)):
+        known[:] = True
+    one, other = model.rotations[first, known], model.rotations[second, known]
+    if min(evidence.certain[model.label == body].sum() for body in (first, second)) < 3:
+        # nothing ties the body to the reference: its turn counts from the middle of the frames
+        at = len(one) // 2
+        return relative_turn(one @ one[at].T, other @ other[at].T, _TURN_SHARE)
+    turn = relative_turn(one, other, _TURN_SHARE)
     if turn > _CLEARLY:
         return turn
     a = np.flatnonzero((model.label == first) & model.core)
@@ -156,7 +170,13 @@ def _turn(first: int, second: int, model: BodyModel, evidence: Evidence) -> floa
     return 0.5 * (turn + float(np.quantile(evidence.turns[np.ix_(a, b)], _TIP_QUANTILE)))
 
 
-def remove(candidate: Candidate, model: BodyModel, evidence: Evidence) -> BodyModel:
+def _seen(body: int, model: BodyModel, evidence: Evidence) -> np.ndarray:
+    """Frames in which enough samples of a body are seen to know its motion, (T,) bool."""
+    seen = evidence.seen[model.label == body]
+    return seen.sum(axis=0) >= max(3, _LEAST_SEEN * len(seen))
+
+
+def remove(candidate: Candidate, model: BodyModel, evidence: Evidence) -> tuple[BodyModel, Evidence]:
     """Take a body away: its samples go to the neighbour that turns alike, or to blends of the neighbours."""
     body = candidate.body
     gone = np.flatnonzero(model.label == body)
@@ -165,7 +185,10 @@ def remove(candidate: Candidate, model: BodyModel, evidence: Evidence) -> BodyMo
         label[gone], partner[gone], share[gone] = candidate.into, -1, 1.0
         affected = np.array([candidate.into])
     else:
-        affected = np.flatnonzero(model.adjacent(evidence.adjacency)[body])
+        reached = np.bincount(model.label[evidence.near[gone].indices], minlength=model.count) > 0
+        reached |= model.adjacent(evidence.adjacency)[body]
+        reached[body] = False
+        affected = np.flatnonzero(reached)
         allowed = np.zeros((len(gone), model.count), bool)
         allowed[:, affected] = True
         any_pair = np.ones((model.count, model.count), bool)
@@ -175,5 +198,6 @@ def remove(candidate: Candidate, model: BodyModel, evidence: Evidence) -> BodyMo
         partner[gone], share[gone] = blends.partner[rows, label[gone]], blends.share[rows, label[gone]]
     orphaned = partner == body
     partner[orphaned], share[orphaned] = -1, 1.0
-    left = refit(replace(model, label=label, partner=partner, share=share), evidence, affected)
-    return reassign(left, evidence, 1)
+    left = replace(model, label=label, partner=partner, share=share)
+    evidence = settle_rest(left, evidence)
+    return reassign(refit(left, evidence, affected), evidence, 1), evidence

@@ -26,8 +26,11 @@ class Evidence:
         Complete.
     weights : (N, T) float
         0 where not seen (filled by neighbours).
+    seen : (N, T) bool
     rest : (N, 3) float, metres
         Positions in the reference.
+    certain : (N,) bool
+        Samples that were seen in the reference; the place of others is found by their body.
     turns : (N, N) float32, radians
         How differently two samples turn.
     adjacency : (N, N) csr_matrix
@@ -46,7 +49,9 @@ class Evidence:
 
     positions: np.ndarray
     weights: np.ndarray
+    seen: np.ndarray
     rest: np.ndarray
+    certain: np.ndarray
     turns: np.ndarray
     adjacency: csr_matrix
     near: csr_matrix
@@ -63,6 +68,7 @@ class Evidence:
             self.positions[samples],
             self.weights[samples],
             self.rest[samples],
+            self.certain[samples],
             model.rotations,
             model.translations,
             allowed,
@@ -171,6 +177,23 @@ def refit(model: BodyModel, evidence: Evidence, bodies: np.ndarray) -> BodyModel
         weights = evidence.weights[members] * (part**2)[:, None]
         rotations[b], translations[b], _ = fit_rigid_motion(seen, rest, weights, evidence.noise)
     return replace(model, rotations=rotations, translations=translations)
+
+
+def settle_rest(model: BodyModel, evidence: Evidence) -> Evidence:
+    """Find where samples that were not seen in the reference are there, by their body.
+
+    The place is the weighted mean over the frames of the positions carried back by the main body's motion.
+    """
+    open_places = np.flatnonzero(~evidence.certain)
+    if not len(open_places):
+        return evidence
+    rest = evidence.rest.copy()
+    for b in np.unique(model.label[open_places]):
+        some = open_places[model.label[open_places] == b]
+        back = (evidence.positions[some] - model.translations[b])[:, :, None, :] @ model.rotations[b]
+        share = evidence.weights[some] / np.maximum(evidence.weights[some].sum(axis=1, keepdims=True), 1e-12)
+        rest[some] = (share[:, :, None] * back[:, :, 0]).sum(axis=1)
+    return replace(evidence, rest=rest)
 
 
 def carry(rotations: np.ndarray, translations: np.ndarray, rest: np.ndarray) -> np.ndarray:

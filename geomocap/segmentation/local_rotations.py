@@ -7,6 +7,8 @@ import numpy as np
 
 from geomocap.segmentation.rotations import nearest_rotation
 
+_LEAST_FRAMES = 8
+
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _local_moments(
@@ -84,14 +86,22 @@ def local_rotations(
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _turn_distances(flat: np.ndarray, rank: int) -> np.ndarray:
-    count, frames = flat.shape[:2]
+def _turn_distances(flat: np.ndarray, known: np.ndarray, share: float, least_frames: int) -> np.ndarray:
+    count, frames = known.shape
+    most = 1 + int(share * (frames - 1))
     result = np.zeros((count, count), np.float32)
     for i in numba.prange(count):
-        least = np.empty(rank, np.float32)
+        least = np.empty(most, np.float32)
         for j in range(i):
+            common = 0
+            for t in range(frames):
+                common += known[i, t] and known[j, t]
+            every = common < least_frames
+            rank = 1 + int(share * ((frames if every else common) - 1))
             least[:] = 3.0
             for t in range(frames):
+                if not (every or (known[i, t] and known[j, t])):
+                    continue
                 trace = np.float32(0.0)
                 for c in range(9):
                     trace += flat[i, t, c] * flat[j, t, c]
@@ -109,13 +119,18 @@ def _turn_distances(flat: np.ndarray, rank: int) -> np.ndarray:
     return result
 
 
-def turn_distances(rotations: np.ndarray, share: float = 0.05, most_frames: int = 120) -> np.ndarray:
+def turn_distances(
+    rotations: np.ndarray, known: np.ndarray | None = None, share: float = 0.05, most_frames: int = 120
+) -> np.ndarray:
     """Angle by which two samples turn differently, exceeded in a small share of the frames.
 
     Parameters
     ----------
     rotations : (N, T, 3, 3) float
         Since a common reference.
+    known : (N, T) bool, optional
+        Where the rotation of a sample is known. Frames in which that of one of the two is not are left out, unless
+        hardly any are left.
     share : float
         Share of the frames in which the angle is larger; 0.05: the 95th percentile.
     most_frames : int
@@ -126,8 +141,9 @@ def turn_distances(rotations: np.ndarray, share: float = 0.05, most_frames: int 
     (N, N) float32, radians
     """
     count, frames = rotations.shape[:2]
+    known = np.ones((count, frames), bool) if known is None else known
     if frames > most_frames:
-        rotations = rotations[:, np.linspace(0, frames - 1, most_frames).round().astype(int)]
-        frames = most_frames
-    flat = np.ascontiguousarray(rotations.reshape(count, frames, 9), np.float32)
-    return _turn_distances(flat, 1 + int(share * (frames - 1)))
+        looked_at = np.linspace(0, frames - 1, most_frames).round().astype(int)
+        rotations, known = rotations[:, looked_at], known[:, looked_at]
+    flat = np.ascontiguousarray(rotations.reshape(*known.shape, 9), np.float32)
+    return _turn_distances(flat, np.ascontiguousarray(known), share, min(_LEAST_FRAMES, known.shape[1]))

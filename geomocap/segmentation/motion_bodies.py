@@ -11,7 +11,7 @@ from scipy.sparse import csr_matrix
 from geomocap.errors import GeometryError
 from geomocap.progress import Progress, silent
 from geomocap.segmentation.body_elimination import Criterion, EliminationStep, eliminate
-from geomocap.segmentation.body_model import BodyModel, Evidence, carry, model_of_labels, reassign
+from geomocap.segmentation.body_model import BodyModel, Evidence, carry, model_of_labels, reassign, refit, settle_rest
 from geomocap.segmentation.connected_linkage import Linkage, connected_linkage
 from geomocap.segmentation.local_rotations import local_rotations, turn_distances
 from geomocap.segmentation.motion_paths import MotionPaths
@@ -20,6 +20,8 @@ from geomocap.segmentation.track_completion import complete_tracks
 from geomocap.settings import Settings
 
 _LEAST_SAMPLES = 20
+_CERTAIN = 0.3
+_SETTLE_ROUNDS = 3
 _STAGE = "bodies"
 
 
@@ -40,7 +42,7 @@ class MotionBodiesSettings(Settings):
         default=0.03, gt=0, lt=0.5, description="surface around a sample that shows how it turns (share of the extent)"
     )
     first_cut_deg: float = Field(
-        default=12.0, gt=0, lt=180, description="groups of samples that turn less differently are the start (degrees)"
+        default=9.0, gt=0, lt=180, description="groups of samples that turn less differently are the start (degrees)"
     )
     min_share: float = Field(default=0.008, ge=0, lt=0.5, description="smallest body (share of the samples)")
     neighbours: int = Field(default=10, ge=4, description="neighbours of a sample on the surface")
@@ -158,20 +160,25 @@ def find_motion_bodies(
     progress(_STAGE, 1, 4)
     radius = max(settings.radius * extent, 2.5 * graph.spacing)
     rotations = local_rotations(positions, reference, weights, graph.geodesics(radius), radius)
-    turns = turn_distances(_known_rotations(paths, rotations))
+    turns = turn_distances(_known_rotations(paths, rotations), certainty > _CERTAIN)
     progress(_STAGE, 2, 4)
     # Too many bodies
-    evidence = _evidence(positions, weights, reference, turns, graph, extent, settings)
+    certain = np.full(paths.count, True) if paths.reference is not None else paths.seen[:, 0]
+    evidence = _evidence(positions, weights, paths.seen, reference, certain, turns, graph, extent, settings)
     linkage = connected_linkage(turns, graph.neighbours)
     least = max(6, round(settings.min_share * paths.count))
     label = absorb_small(linkage.cut(np.deg2rad(settings.first_cut_deg)), turns, graph, least)
     if settings.bodies > int(label.max()) + 1:
         label = linkage.cut_count(settings.bodies)
     model = reassign(model_of_labels(label, evidence), evidence, 4).compact()
+    if not evidence.certain.all():
+        for _ in range(_SETTLE_ROUNDS):
+            evidence = settle_rest(model, evidence)
+            model = reassign(refit(model, evidence, np.arange(model.count)), evidence, 1).compact()
     progress(_STAGE, 3, 4)
     # Those that are there
     criterion = Criterion(np.deg2rad(settings.min_turn_deg), np.deg2rad(settings.min_excess_deg), 0.05 * extent)
-    model, curve = eliminate(model, evidence, criterion, settings.bodies or None)
+    model, evidence, curve = eliminate(model, evidence, criterion, settings.bodies or None)
     model = reassign(model, evidence, 3).compact()
     progress(_STAGE, 4, 4)
     return _result(model, evidence, paths, graph, curve, linkage, extent)
@@ -187,7 +194,9 @@ def _known_rotations(paths: MotionPaths, fitted: np.ndarray) -> np.ndarray:
 def _evidence(
     positions: np.ndarray,
     weights: np.ndarray,
+    seen: np.ndarray,
     rest: np.ndarray,
+    certain: np.ndarray,
     turns: np.ndarray,
     graph: SurfaceGraph,
     extent: float,
@@ -197,7 +206,9 @@ def _evidence(
     return Evidence(
         positions,
         weights,
+        seen,
         rest,
+        certain,
         turns,
         graph.adjacency,
         near,

@@ -34,6 +34,7 @@ def _explain(
     positions: np.ndarray,
     weights: np.ndarray,
     rest: np.ndarray,
+    certain: np.ndarray,
     rotations: np.ndarray,
     translations: np.ndarray,
     allowed: np.ndarray,
@@ -50,17 +51,27 @@ def _explain(
         total = 1e-12
         for t in range(frames):
             total += weights[i, t]
+        place = np.empty(3)
         miss = np.empty((bodies, frames, 3))  # observed minus carried by the body
         for b in range(bodies):
             if not allowed[i, b]:
                 continue
+            if certain[i]:
+                place[:] = rest[i]
+            else:
+                place[:] = 0.0
+                for t in range(frames):
+                    for c in range(3):
+                        away = weights[i, t] / total * (positions[i, t, c] - translations[b, t, c])
+                        for d in range(3):
+                            place[d] += rotations[b, t, c, d] * away
             cost = 0.0
             for t in range(frames):
                 square = 0.0
                 for c in range(3):
                     carried = translations[b, t, c]
                     for d in range(3):
-                        carried += rotations[b, t, c, d] * rest[i, d]
+                        carried += rotations[b, t, c, d] * place[d]
                     miss[b, t, c] = positions[i, t, c] - carried
                     square += miss[b, t, c] ** 2
                 cost += weights[i, t] * min(square, cap)
@@ -104,6 +115,7 @@ def explain(
     positions: np.ndarray,
     weights: np.ndarray,
     rest: np.ndarray,
+    certain: np.ndarray,
     rotations: np.ndarray,
     translations: np.ndarray,
     allowed: np.ndarray,
@@ -119,6 +131,8 @@ def explain(
     ----------
     positions, weights : (N, T, 3) float, metres; (N, T) float
     rest : (N, 3) float, metres
+    certain : (N,) bool
+        Where `rest` is known; elsewhere each body may put the sample where it fits best.
     rotations, translations : (B, T, 3, 3), (B, T, 3) float
         Motions of the bodies since the reference.
     allowed : (N, B) bool
@@ -134,6 +148,7 @@ def explain(
             np.ascontiguousarray(positions),
             weights,
             rest,
+            certain,
             np.ascontiguousarray(rotations),
             np.ascontiguousarray(translations),
             allowed,

@@ -77,15 +77,13 @@ def fit_articulated(
     hierarchy: Hierarchy,
     joints: np.ndarray,
     start: np.ndarray,
-    smoothing: float,
     rounds: int,
 ) -> ArticulatedMotion:
     """Rotations of all bodies and the path of the root that fit all bodies' samples best, joints kept together.
 
     Gauss–Newton on the turns of all bodies and the root's translation, frame by frame, all 3 B + 3 unknowns at once. A
     body is carried by the chain of joints from the root: x = p_root + Σ R_a (c_next - c_a) + R_b (X - c_b), so that a
-    turn of a moves all that hangs on it. Rotations of neighbouring frames are tied by a first difference to the mean of
-    the frames before and after, which bridges frames without samples and takes away jitter without lag.
+    turn of a moves all that hangs on it.
 
     Parameters
     ----------
@@ -95,8 +93,6 @@ def fit_articulated(
         In frame 0.
     start : (T, B, 3, 3) float
         First rotations.
-    smoothing : float
-        Weight of the temporal prior, in samples at the radius of gyration; 0: none.
     rounds : int
     """
     rotations = np.array(start, float)
@@ -104,9 +100,6 @@ def fit_articulated(
     arms, anchors = _chains(hierarchy, joints, bodies)
     total = np.maximum(moments.weight.sum(axis=1), 1e-9)
     root = _root_positions(rotations, moments, arms, anchors, total)
-    inertia = np.trace(moments.scatter, axis1=2, axis2=3)
-    usual = np.median(np.where(inertia > 0, inertia, np.nan), axis=0)
-    usual = np.where(np.isfinite(usual), usual, 1e-6)
     for _ in range(rounds):
         normal = np.zeros((frames, 3 * bodies + 3, 3 * bodies + 3))
         right = np.zeros((frames, 3 * bodies + 3))
@@ -131,14 +124,6 @@ def fit_articulated(
             normal[:, here, here] += spread
             twist = moments.correlation[:, b] @ rotations[:, b].swapaxes(1, 2)
             right[:, here] += _axial(twist)
-        if smoothing > 0 and frames > 2:
-            middle = _middle_rotations(rotations)
-            towards = _axial(middle @ rotations.swapaxes(2, 3))
-            for b in range(bodies):
-                here = slice(3 * b, 3 * b + 3)
-                strength = smoothing * usual[b]
-                normal[:, here, here] += strength * np.eye(3)
-                right[:, here] += strength * towards[:, b]
         normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3 * bodies + 3)
         step = np.linalg.solve(normal, right[..., None])[..., 0]
         turns = np.clip(step[:, :-3].reshape(frames, bodies, 3), -0.5, 0.5)
@@ -187,12 +172,6 @@ def _kinematics(
     translations = own - np.einsum("tbij,bj->tbi", rotations, anchors)
     children = hierarchy.joint_bodies[:, 1]
     return ArticulatedMotion(rotations, translations, own[:, children])
-
-
-def _middle_rotations(rotations: np.ndarray) -> np.ndarray:
-    before = np.concatenate([rotations[1:2], rotations[:-1]])
-    after = np.concatenate([rotations[1:], rotations[-2:-1]])
-    return nearest_rotation(before + after)
 
 
 def _axial(matrix: np.ndarray) -> np.ndarray:

@@ -20,9 +20,12 @@ from geomocap.skeleton.hierarchy import Hierarchy
 from geomocap.skeleton.motion import local_rotations
 from geomocap.skeleton.skeleton import Skeleton
 from geomocap.skeleton.spanning_tree import Connection, connect_by_cost, connection_cost
+from geomocap.skeleton.temporal_smoothing import smooth_positions, smooth_rotations
 
 _NEAREST = 6
 _FRAMES = 10
+_UNSEEN = 0.05
+_BRIDGE = 1e-3
 
 
 class MotionSkeletonSettings(Settings):
@@ -45,9 +48,7 @@ class MotionSkeletonSettings(Settings):
     )
     largest_gap: float = Field(default=0.1, gt=0, description="bodies farther apart are not connected (extents)")
     smoothing: float = Field(
-        default=0.0,
-        ge=0,
-        description="ties turns to those of the frames before and after (times the bodies' own samples)",
+        default=0.0, ge=0, description="weight of an even pace against the samples; 1 halves what changes in 3 frames"
     )
     rounds: int = Field(default=6, ge=1, description="rounds of the fit that keeps joints together")
 
@@ -101,11 +102,26 @@ def find_motion_skeleton(
     middle = np.stack([bodies.rest[bodies.label == b].mean(axis=0) for b in range(count)])
     spread = [np.sqrt(((bodies.rest[bodies.label == b] - middle[b]) ** 2).sum(axis=1).mean()) for b in range(count)]
     weights = bodies.reliability * sizes * len(bodies.label) + 1e-3
-    moments = prior_moments(bodies.rotations, bodies.translations, middle, np.array(spread), weights)
-    motion = fit_articulated(moments, hierarchy, joints, bodies.rotations, settings.smoothing, settings.rounds)
+    turned, moved = _smooth_motion(bodies, middle, settings.smoothing)
+    moments = prior_moments(turned, moved, middle, np.array(spread), weights)
+    motion = fit_articulated(moments, hierarchy, joints, turned, settings.rounds)
     centers = np.einsum("tbij,bj->tbi", motion.rotations, middle) + motion.translations
     skeleton = skeleton_of_motion(hierarchy, joints, motion.rotations, motion.joint_positions, centers, middle, fps)
     return MotionSkeleton(skeleton, tuple(c.joint for c in chosen), np.array([c.cost for c in chosen]))
+
+
+def _smooth_motion(bodies: MotionBodies, middle: np.ndarray, strength: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations and translations of all bodies, smooth in time; frames without samples are bridged."""
+    rotations, translations = bodies.rotations.copy(), bodies.translations.copy()
+    for b in range(bodies.body_count):
+        weights = bodies.reliability[:, b] / max(float(bodies.reliability[:, b].max()), 1e-9)
+        # where nothing is seen the motion is bridged in any case
+        bridged = strength if strength > 0 else (_BRIDGE if (weights < _UNSEEN).any() else 0.0)
+        weights = np.where(weights < _UNSEEN, 0.0, weights)
+        rotations[:, b] = smooth_rotations(bodies.rotations[:, b], weights, bridged)
+        path = smooth_positions(bodies.centers[:, b], weights, bridged)
+        translations[:, b] = path - rotations[:, b] @ middle[b]
+    return rotations, translations
 
 
 def possible_connections(bodies: MotionBodies, settings: MotionSkeletonSettings) -> list[Connection]:

@@ -1,0 +1,63 @@
+"""Chains of boxes that turn about hinges, with the truth of every sample: for tests of bodies from motion paths."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+
+@dataclass(frozen=True)
+class Chain:
+    """positions (N, T, 3), body (N,), rotations (T, B, 3, 3) since frame 0, joints (J, 3) in frame 0, axes (J, 3)."""
+
+    positions: np.ndarray
+    body: np.ndarray
+    rotations: np.ndarray
+    translations: np.ndarray
+    joints: np.ndarray
+    axes: np.ndarray
+
+
+def box_surface(rng: np.random.Generator, count: int, low: list[float], high: list[float]) -> np.ndarray:
+    """Points on the long sides of a box."""
+    size = np.array(high) - low
+    points = rng.random((count, 3)) * size + low
+    side = rng.integers(0, 2, count) + 1
+    points[np.arange(count), side] = np.where(rng.random(count) < 0.5, np.array(low)[side], np.array(high)[side])
+    return points
+
+
+def chain(bodies: int = 3, frames: int = 24, samples: int = 90, turn_deg: float = 50.0, seed: int = 0) -> Chain:
+    """Boxes 0.4 m long in a row along x; each turns against the one before, about z and y by turns."""
+    rng = np.random.default_rng(seed)
+    rest, body = [], []
+    for b in range(bodies):
+        rest.append(box_surface(rng, samples, [0.4 * b, -0.06, -0.05], [0.4 * b + 0.4, 0.06, 0.05]))
+        body += [b] * samples
+    points = np.concatenate(rest)
+    joints = np.array([[0.4 * b, 0.0, 0.0] for b in range(1, bodies)])
+    axes = np.array([[0.0, 0.0, 1.0] if b % 2 else [0.0, 1.0, 0.0] for b in range(1, bodies)])
+    time = np.arange(frames) / (frames - 1)
+    rotations = np.tile(np.eye(3), (frames, bodies, 1, 1))
+    translations = np.zeros((frames, bodies, 3))
+    rotations[:, 0] = Rotation.from_rotvec(np.outer(np.sin(2 * np.pi * time), [0.2, 0.3, 0.1])).as_matrix()
+    translations[:, 0] = np.outer(time, [0.5, 0.1, 0.0])
+    for b in range(1, bodies):
+        angle = np.deg2rad(turn_deg) * np.sin(2 * np.pi * time * (1 + 0.5 * b))
+        local = Rotation.from_rotvec(angle[:, None] * axes[b - 1]).as_matrix()
+        rotations[:, b] = rotations[:, b - 1] @ local
+        place = rotations[:, b - 1] @ joints[b - 1] + translations[:, b - 1]
+        translations[:, b] = place - rotations[:, b] @ joints[b - 1]
+    labels = np.array(body)
+    positions = np.einsum("tnij,nj->nti", rotations[:, labels], points) + translations[:, labels].swapaxes(0, 1)
+    return Chain(positions, labels, rotations, translations, joints, axes)
+
+
+def same_partition(found: np.ndarray, true: np.ndarray) -> float:
+    """Share of samples whose body is the one that covers their true body best, one to one at best."""
+    table = np.zeros((true.max() + 1, found.max() + 1))
+    np.add.at(table, (true, found), 1)
+    best = table.argmax(axis=1)
+    return float(sum(table[b, best[b]] for b in range(len(best)) if (best == best[b]).sum() == 1) / len(true))

@@ -1,0 +1,320 @@
+import numpy as np
+import pytest
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.spatial.distance import squareform
+from scipy.spatial.transform import Rotation
+
+from geomocap.errors import GeometryError
+from geomocap.segmentation.connected_linkage import connected_linkage
+from geomocap.segmentation.local_rotations import local_rotations, turn_distances
+from geomocap.segmentation.motion_bodies import MotionBodiesSettings, find_motion_bodies
+from geomocap.segmentation.motion_labels import label_points
+from geomocap.segmentation.motion_paths import MotionPaths
+from geomocap.segmentation.rigid_motions import fit_rigid_motion, turn_angles
+from geomocap.segmentation.skin_blending import explain
+from geomocap.segmentation.surface_graph import lasting_distances, surface_graph
+from geomocap.segmentation.track_completion import complete_tracks
+from geomocap.skeleton.articulated_motion import fit_articulated, prior_moments
+from geomocap.skeleton.common_points import common_point
+from geomocap.skeleton.hierarchy import Hierarchy
+from geomocap.skeleton.motion_skeleton import find_motion_skeleton
+from geomocap.skeleton.temporal_smoothing import smooth_positions, smooth_rotations
+from tests.geomocap.moving_chains import chain, same_partition
+
+
+@pytest.fixture(scope="module")
+def three():
+    return chain(3)
+
+
+@pytest.fixture(scope="module")
+def found(three):
+    return find_motion_bodies(MotionPaths(three.positions))
+
+
+def test_bodies_of_a_chain_are_found_with_their_number(three, found):
+    assert found.body_count == 3
+    assert same_partition(found.label, three.body) > 0.97
+    np.testing.assert_allclose(found.weights.sum(axis=1), 1.0)
+    assert found.reliability.shape == (24, 3)
+
+
+def test_motions_of_the_bodies_are_the_true_ones(three, found):
+    for b in range(3):
+        members = three.body[found.label == b]
+        true = np.bincount(members).argmax()
+        difference = np.swapaxes(found.rotations[:, b], 1, 2) @ three.rotations[:, true]
+        assert np.rad2deg(turn_angles(difference)).max() < 0.5
+    np.testing.assert_allclose(found.rotations[0], np.tile(np.eye(3), (3, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(found.translations[0], 0.0, atol=1e-12)
+
+
+def test_result_is_the_same_bit_for_bit(three, found):
+    again = find_motion_bodies(MotionPaths(three.positions))
+    np.testing.assert_array_equal(again.label, found.label)
+    np.testing.assert_array_equal(again.rotations, found.rotations)
+
+
+def test_number_of_bodies_can_be_given(three):
+    for wanted in (2, 4):
+        assert (
+            find_motion_bodies(MotionPaths(three.positions), MotionBodiesSettings(bodies=wanted)).body_count == wanted
+        )
+
+
+def test_bodies_that_turn_less_are_one():
+    small = chain(2, turn_deg=8.0)
+    assert find_motion_bodies(MotionPaths(small.positions)).body_count == 1
+
+
+def test_soft_skin_is_no_body_of_its_own():
+    two = chain(2, samples=250, turn_deg=45.0)
+    weight = np.clip((two.positions[:, 0, 0] - 0.25) / 0.3, 0.0, 1.0)  # 0.3 m of skin between the two
+    rest = two.positions[:, 0]
+    first = np.einsum("tij,nj->nti", two.rotations[:, 0], rest) + two.translations[:, 0]
+    second = np.einsum("tij,nj->nti", two.rotations[:, 1], rest) + two.translations[:, 1]
+    paths = MotionPaths((1 - weight)[:, None, None] * first + weight[:, None, None] * second)
+    bodies = find_motion_bodies(paths)
+    assert bodies.body_count == 2
+    rigid = (weight == 0) | (weight == 1)
+    assert same_partition(bodies.label[rigid], (weight[rigid] > 0.5).astype(int)) == 1.0
+    of_second = bodies.weights[:, bodies.label[np.argmax(rest[:, 0])]]
+    assert np.abs(of_second - weight)[~rigid].mean() < 0.12  # even blends are penalised
+
+
+def test_broken_paths_give_the_same_bodies(three):
+    rng = np.random.default_rng(1)
+    start = rng.integers(-6, 16, len(three.body))
+    frame = np.arange(24)
+    alive = (frame >= start[:, None]) & (frame < start[:, None] + 12)
+    positions = np.where(alive[..., None], three.positions, np.nan)
+    bodies = find_motion_bodies(MotionPaths(positions))
+    assert bodies.body_count == 3
+    assert same_partition(bodies.label, three.body) > 0.93
+    gap = ~alive
+    miss = np.linalg.norm(bodies.positions - three.positions, axis=2)[gap]
+    assert np.median(miss) < 0.02
+
+
+def test_joints_hinges_and_tree_of_a_chain(three, found):
+    result = find_motion_skeleton(found, 30.0)
+    skeleton = result.skeleton
+    assert len(skeleton.joint_positions[0]) == 2
+    # the middle body is connected to both others
+    middle = np.bincount(found.label[three.body == 1]).argmax()
+    assert (skeleton.joint_bodies == middle).any(axis=1).all()
+    for position, joint in zip(skeleton.joint_positions[0], result.joints, strict=True):
+        true = int(np.linalg.norm(three.joints - position, axis=1).argmin())
+        across = three.joints[true] - position
+        across -= three.axes[true] * (across @ three.axes[true])
+        assert np.linalg.norm(across) < 0.003
+        assert np.linalg.norm(three.joints[true] - position) < 0.04  # along the axis the border decides
+        assert joint.hinge
+        assert np.rad2deg(np.arccos(min(1.0, abs(joint.axis @ three.axes[true])))) < 1.0
+
+
+def test_joints_stay_fixed_in_both_bodies_and_follow_forward_kinematics(found):
+    skeleton = find_motion_skeleton(found, 30.0).skeleton
+    np.testing.assert_allclose(skeleton.bone_fixed_positions(), skeleton.joint_positions, atol=1e-9)
+    between = np.linalg.norm(skeleton.joint_positions[:, 0] - skeleton.joint_positions[:, 1], axis=1)
+    siblings = skeleton.joint_bodies[0, 0] == skeleton.joint_bodies[1, 0]
+    chained = skeleton.joint_bodies[0, 1] == skeleton.joint_bodies[1, 0]
+    assert siblings or chained
+    np.testing.assert_allclose(between, between[0], atol=1e-9)
+
+
+def test_smoothing_takes_away_jitter_without_lag():
+    rng = np.random.default_rng(2)
+    angles = 0.7 * np.sin(np.arange(60) / 9.0)
+    true = Rotation.from_rotvec(angles[:, None] * np.array([0.6, 0.0, 0.8])).as_matrix()
+    noisy = true @ Rotation.from_rotvec(rng.normal(scale=0.03, size=(60, 3))).as_matrix()
+    noisy[31] = np.eye(3)  # an outlier
+    smooth = smooth_rotations(noisy, np.ones(60), 20.0)
+    inner = np.delete(np.arange(5, 55), 26)
+    miss = turn_angles(smooth.swapaxes(1, 2) @ true)
+    assert miss[inner].mean() < 0.6 * turn_angles(noisy.swapaxes(1, 2) @ true)[inner].mean()
+    assert miss[31] < 0.06
+    before = turn_angles(true[:-1].swapaxes(1, 2) @ smooth[1:]).mean()
+    after = turn_angles(true[1:].swapaxes(1, 2) @ smooth[:-1]).mean()
+    assert abs(before - after) < 0.1 * max(before, after)
+    path = np.stack([np.sin(np.arange(60) / 9.0)] * 3, axis=1)
+    jumpy = path + rng.normal(scale=0.02, size=path.shape)
+    assert np.abs(smooth_positions(jumpy, np.ones(60), 20.0) - path).mean() < 0.6 * np.abs(jumpy - path).mean()
+
+
+def test_frames_without_samples_are_bridged():
+    true = Rotation.from_rotvec(0.7 * np.sin(np.arange(40) / 9.0)[:, None] * np.array([0.6, 0.0, 0.8])).as_matrix()
+    broken = true.copy()
+    broken[18:24] = np.eye(3)
+    weights = np.ones(40)
+    weights[18:24] = 0.0
+    bridged = smooth_rotations(broken, weights, 1e-3)
+    assert np.rad2deg(turn_angles(bridged.swapaxes(1, 2) @ true)).max() < 1.0
+
+
+def test_connected_bodies_keep_their_joints_and_come_near_the_samples():
+    moving = chain(3, frames=12, turn_deg=30.0)
+    middle = np.array([[0.2, 0, 0], [0.6, 0, 0], [1.0, 0, 0]])
+    moments = prior_moments(moving.rotations, moving.translations, middle, np.full(3, 0.1), np.full((12, 3), 40.0))
+    tree = Hierarchy(1, np.array([[1, 0], [1, 2]], np.int32))
+    start = np.tile(np.eye(3), (12, 3, 1, 1))
+    fitted = fit_articulated(moments, tree, moving.joints, start, 20)
+    np.testing.assert_allclose(fitted.rotations, moving.rotations, atol=1e-6)
+    np.testing.assert_allclose(fitted.translations, moving.translations, atol=1e-6)
+    for j, (parent, child) in enumerate(tree.joint_bodies):
+        for body in (parent, child):
+            carried = fitted.rotations[:, body] @ moving.joints[j] + fitted.translations[:, body]
+            np.testing.assert_allclose(carried, fitted.joint_positions[:, j], atol=1e-9)
+
+
+def test_points_of_any_frame_get_the_bodies_of_the_samples(three, found):
+    paths = MotionPaths(three.positions)
+    rng = np.random.default_rng(5)
+    for frame in (0, 13):
+        points = three.positions[:, frame] + rng.normal(scale=0.003, size=(len(three.body), 3))
+        labels = label_points(found, paths, frame, points)
+        assert labels.dtype == np.int32
+        assert (labels == found.label).mean() > 0.95
+    assert len(label_points(found, paths, 0, np.empty((0, 3)))) == 0
+
+
+def test_wrong_paths_are_refused(three):
+    with pytest.raises(GeometryError, match="expected \\(N, T, 3\\)"):
+        MotionPaths(np.zeros((4, 3)))
+    with pytest.raises(GeometryError, match="sigma"):
+        MotionPaths(three.positions, sigma=np.ones(3))
+    with pytest.raises(GeometryError, match="without any position"):
+        MotionPaths(np.full((4, 5, 3), np.nan))
+    with pytest.raises(GeometryError, match="5 samples"):
+        find_motion_bodies(MotionPaths(three.positions[:5]))
+
+
+def test_lasting_distances_are_the_third_largest():
+    positions = np.random.default_rng(0).random((7, 20, 3))
+    apart = np.linalg.norm(positions[:, None] - positions[None], axis=3)
+    np.testing.assert_allclose(lasting_distances(positions), np.sort(apart, axis=2)[:, :, -3], rtol=1e-6)
+
+
+def test_samples_that_touch_for_a_while_are_no_neighbours():
+    line = np.stack([np.linspace(0, 1, 30), np.zeros(30), np.zeros(30)], axis=1)
+    frames = 20
+    fixed = np.tile(line[:, None], (1, frames, 1))
+    other = fixed + np.array([0.0, 0.01, 0.0])
+    other[:, 8:] += np.array([0.0, 0.5, 0.0])
+    positions = np.concatenate([fixed, other])
+    linked = surface_graph(positions, positions[:, 0], 4, 2.0).neighbours
+    assert not linked[:30, 30:].any()
+    assert linked[np.arange(29), np.arange(1, 30)].all()
+
+
+def test_local_rotations_and_their_distances_are_the_reference_ones():
+    rng = np.random.default_rng(3)
+    positions, weights = rng.random((12, 5, 3)), rng.random((12, 5))
+    geodesics = np.linalg.norm(positions[:, None, 0] - positions[None, :, 0], axis=2)
+    radius = 0.6
+    fitted = local_rotations(positions, positions[:, 0], weights, geodesics, radius)
+    for i in (0, 7):
+        near = geodesics[i] <= radius
+        for t in (1, 4):
+            w = np.exp(-((geodesics[i, near] / (0.6 * radius)) ** 2)) * weights[near, t]
+            start, moved = positions[near, 0], positions[near, t]
+            expected = Rotation.align_vectors(
+                moved - np.average(moved, axis=0, weights=w), start - np.average(start, axis=0, weights=w), weights=w
+            )[0].as_matrix()
+            np.testing.assert_allclose(fitted[i, t], expected, atol=1e-5)
+    angles = turn_angles(np.einsum("atij,btik->abtjk", fitted, fitted))
+    np.testing.assert_allclose(turn_distances(fitted, share=0.3), np.sort(angles, axis=2)[:, :, -2], atol=2e-3)
+
+
+def test_linkage_of_samples_that_are_all_neighbours_is_average_linkage():
+    rng = np.random.default_rng(4)
+    points = rng.random((40, 2))
+    distances = np.linalg.norm(points[:, None] - points[None], axis=2)
+    tree = connected_linkage(distances, ~np.eye(40, dtype=bool))
+    expected = linkage(squareform(distances, checks=False), "average")
+    np.testing.assert_allclose(tree.heights, expected[:, 2])
+    cut = tree.cut(0.3)
+    reference = fcluster(expected, 0.3, "distance")
+    assert len(np.unique(np.stack([cut, reference]), axis=1).T) == len(np.unique(cut)) == len(np.unique(reference))
+    assert tree.cut_count(7).max() == 6
+
+
+def test_linkage_never_joins_what_is_not_connected():
+    linked = np.zeros((6, 6), bool)
+    for a, b in ((0, 1), (1, 2), (3, 4), (4, 5)):
+        linked[a, b] = linked[b, a] = True
+    tree = connected_linkage(np.zeros((6, 6)), linked)
+    np.testing.assert_array_equal(tree.cut(1.0), [0, 0, 0, 1, 1, 1])
+
+
+def test_rigid_motion_is_steady_against_samples_that_do_not_follow():
+    rng = np.random.default_rng(6)
+    rest = rng.random((40, 3))
+    true = Rotation.from_rotvec(rng.normal(scale=0.5, size=(6, 3))).as_matrix()
+    positions = np.einsum("tij,nj->nti", true, rest) + 1.0
+    positions[:8] += rng.normal(scale=0.3, size=(8, 6, 3))
+    rotations, translations, residuals = fit_rigid_motion(positions, rest, np.ones((40, 6)), 1e-4)
+    assert np.rad2deg(turn_angles(rotations.swapaxes(1, 2) @ true)).max() < 0.05
+    assert np.abs(translations - 1.0).max() < 1e-3
+    assert residuals[:8].min() > residuals[8:].max()
+
+
+def test_blends_are_those_of_a_search_over_weights():
+    rng = np.random.default_rng(7)
+    rotations = Rotation.from_rotvec(rng.normal(scale=0.4, size=(15, 3))).as_matrix().reshape(3, 5, 3, 3)
+    translations = rng.normal(scale=0.1, size=(3, 5, 3))
+    rest = rng.random((4, 3))
+    carried = np.einsum("btij,nj->nbti", rotations, rest) + translations[None]
+    weights = rng.random((4, 5)) + 0.2
+    mix = np.array([[0.7, 0.3, 0.0], [0.0, 0.2, 0.8], [1.0, 0.0, 0.0], [0.45, 0.0, 0.55]])
+    positions = np.einsum("nb,nbti->nti", mix, carried) + rng.normal(scale=0.003, size=(4, 5, 3))
+    penalty = 0.02
+    everything = np.ones((4, 3), bool), np.ones((3, 3), bool)
+    blends = explain(positions, weights, rest, np.ones(4, bool), rotations, translations, *everything, penalty, 10.0)
+    for i in range(4):
+        best = {}
+        for a in range(3):
+            for b in range(3):
+                if a == b:
+                    continue
+                for w in np.linspace(0.5, 1.0, 2001):
+                    miss = ((w * carried[i, a] + (1 - w) * carried[i, b] - positions[i]) ** 2).sum(axis=1)
+                    cost = np.average(miss, weights=weights[i]) + 4 * w * (1 - w) * penalty**2
+                    best[a] = min(best.get(a, (np.inf, 0.0)), (cost, w))
+        main = int(np.argmin(blends.costs[i]))
+        assert main == min(best, key=lambda a: best[a])
+        assert blends.costs[i, main] == pytest.approx(best[main][0], rel=1e-3, abs=1e-9)
+        assert blends.share[i, main] == pytest.approx(best[main][1], abs=2e-3)
+
+
+def test_common_point_of_two_motions_and_its_kind():
+    rng = np.random.default_rng(8)
+    point = np.array([0.3, -0.2, 0.5])
+    first = Rotation.from_rotvec(rng.normal(scale=0.3, size=(40, 3)))
+    for hinge in (True, False):
+        turns = rng.normal(scale=0.5, size=(40, 3))
+        if hinge:
+            turns = turns[:, :1] * np.array([0.0, 0.6, 0.8])
+        second = first * Rotation.from_rotvec(turns)
+        rotations = first.as_matrix(), second.as_matrix()
+        start = rng.normal(scale=0.2, size=(40, 3))
+        translations = start, start + rotations[0] @ point - rotations[1] @ point
+        near = point + (np.array([0.0, 0.06, 0.08]) if hinge else np.array([0.1, 0.0, 0.0]))
+        joint = common_point(rotations, translations, np.ones(40), near, 1e-6, 1e-4, 0.1)
+        assert joint.hinge == hinge
+        if hinge:  # along the axis the prior decides
+            np.testing.assert_allclose(joint.point, near, atol=1e-4)
+            np.testing.assert_allclose(np.abs(joint.axis), [0.0, 0.6, 0.8], atol=1e-3)
+            assert joint.std[2] > 10 * joint.std[0]
+        else:
+            np.testing.assert_allclose(joint.point, point, atol=1e-4)
+
+
+def test_completion_carries_gaps_with_the_neighbours(three):
+    positions = three.positions.copy()
+    positions[::5, 6:18] = np.nan
+    filled, certainty = complete_tracks(MotionPaths(positions))
+    miss = np.linalg.norm(filled - three.positions, axis=2)
+    assert np.median(miss[::5, 6:18]) < 0.01
+    assert (certainty[::5, 6:18] < 1).all() and (certainty[::5, 6:18] > 0).all()
+    np.testing.assert_array_equal(filled[1::5], three.positions[1::5])
