@@ -91,7 +91,7 @@ class CoarseModel:
         for start in starts:
             found.append(self.fit(frame, start, NEAR, False))
             found.append(self.fit(frame, start, FAR, True))
-        best = min(found, key=lambda s: s.cost + self._surprise(s, starts[0]))
+        best = min(found, key=lambda s: self.cost(s, starts[0]))
         # where the frame's normals contradict the surface that was found, they may be on the wrong side
         y, normals = self.graph.deform(best.x, best.R)
         points = frame.target.points.turned_like(y, normals, 0.5 * self.graph.spacing)
@@ -100,16 +100,23 @@ class CoarseModel:
         turned = replace(frame, target=replace(frame.target, points=points))
         return min(best, self.fit(turned, best, NEAR, False), key=lambda s: s.cost)
 
-    def _surprise(self, state: State, expected: State) -> float:
-        """Cost of being elsewhere than expected: two limbs that seem to have changed places have not."""
+    def cost(self, state: State, expected: State) -> float:
+        """Cost of a state, and of being elsewhere than expected: limbs that seem to have changed places have not."""
         away = np.linalg.norm(state.x - expected.x, axis=1) / (2 * self.graph.spacing)
-        return self.settings.inertia_cost * float((np.minimum(away, 1.0) ** 2).mean())
+        return state.cost + self.settings.inertia_cost * float((np.minimum(away, 1.0) ** 2).mean())
+
+    def between(self, last: State, following: State) -> State:
+        """Halfway between two states, made as rigid as can be."""
+        half = vector_of(following.R @ last.R.transpose(0, 2, 1)) / 2
+        return self._relaxed((last.x + following.x) / 2, rotation_of(half) @ last.R)
 
     def expected(self, last: State, before: State) -> State:
         """Go on with the motion of the last frame, made as rigid as can be."""
         m = self.settings.momentum
         turn = vector_of(last.R @ before.R.transpose(0, 2, 1))
-        x, R = last.x + m * (last.x - before.x), rotation_of(m * turn) @ last.R
+        return self._relaxed(last.x + m * (last.x - before.x), rotation_of(m * turn) @ last.R)
+
+    def _relaxed(self, x: np.ndarray, R: np.ndarray) -> State:
         hold = np.tile(0.05 * np.eye(3), (len(self.graph.samples), 1, 1))
         y = self.graph.deform(x, R)[0]
         for _ in range(2):
@@ -179,23 +186,20 @@ def follow(model: CoarseModel, frames: list[CoarseTarget], reference: int, way: 
 
 
 def mend(model: CoarseModel, frames: list[CoarseTarget], states: list[State], reference: int, way: int) -> list[State]:
-    """Try each frame again from the neighbours that follow it in time, and keep what costs less.
+    """Try frames that don't fit between their neighbours in time again, starting between and from the neighbours.
 
-    A limb that is lost where it moves fast is found again from the other side.
+    A limb that was lost or taken for another where it moved fast is found again from the other side.
     """
     states = list(states)
     T = len(states)
-    usual = float(np.median([s.cost for s in states]))
-    order = range(T - 2, -1, -1) if way < 0 else range(1, T)
-    for t in order:
-        if t == reference or states[t].cost < usual:
+    if T < 3:
+        return states
+    between = [model.between(states[t - 1], states[t + 1]) for t in range(1, T - 1)]
+    usual = float(np.median([model.cost(s, b) for s, b in zip(states[1:-1], between, strict=True)]))
+    for t in range(1, T - 1) if way > 0 else range(T - 2, 0, -1):
+        middle = model.between(states[t - 1], states[t + 1])
+        if t == reference or model.cost(states[t], middle) < usual:
             continue
-        near = states[t - way]
-        starts = [near]
-        if 0 <= t - 2 * way < T:
-            starts.append(model.expected(near, states[t - 2 * way]))
-        found = [model.fit(frames[t], s, NEAR, False) for s in starts]
-        best = min(found, key=lambda s: s.cost)
-        if best.cost < 0.97 * states[t].cost:
-            states[t] = best
+        tried = [model.fit(frames[t], start, NEAR, False) for start in (middle, states[t + 1], states[t - 1])]
+        states[t] = min([states[t], *tried], key=lambda s: model.cost(s, middle))
     return states
