@@ -25,144 +25,20 @@ import numpy as np
 from numba import njit, prange
 
 from geomocap.matching.spline import FAST
-
-LEAST_SAMPLES = 0.6
-"""Share of a template's samples that a camera must show for it to count."""
+from geomocap.tracking.patch_templates import (
+    LEAST_SAMPLES,
+    LEAST_VARIANCE,
+    bilinear,
+    local_camera,
+    solve_normal,
+    turn_by,
+)
 
 LEAST_FACING = 0.2
 """Cosine between normal and viewing ray below which a sample is not used."""
 
 _FLOOR = 2.0  # noise of an image that even a perfect fit is granted, grey levels
-_LEAST_VARIANCE = 4.0  # of the grey levels under a patch
 _GAIN = 3.0  # most contrast that an image may lose or win against the template
-
-
-@njit(cache=True, nogil=True, fastmath=FAST, inline="always")
-def _bilinear(image, x, y):
-    i, j = int(x), int(y)
-    a, b = x - i, y - j
-    top = image[j, i] * (1 - a) + image[j, i + 1] * a
-    low = image[j + 1, i] * (1 - a) + image[j + 1, i + 1] * a
-    return top * (1 - b) + low * b
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _local_camera(P, X, Q, A):
-    """Projection of the patch's own coordinates: P [Q X; 0 1] into `A` (3, 4)."""
-    for i in range(3):
-        for j in range(3):
-            A[i, j] = P[i, 0] * Q[0, j] + P[i, 1] * Q[1, j] + P[i, 2] * Q[2, j]
-        A[i, 3] = P[i, 0] * X[0] + P[i, 1] * X[1] + P[i, 2] * X[2] + P[i, 3]
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _cholesky_solve(N, b, L, x):
-    """Solve N x = b with N (6, 6) symmetric, lower triangle given; returns whether it is positive definite."""
-    for i in range(6):
-        for j in range(i + 1):
-            s = N[i, j]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            if i == j:
-                if s <= 1e-12 * N[i, i] or s <= 0:
-                    return False
-                L[i, i] = math.sqrt(s)
-            else:
-                L[i, j] = s / L[j, j]
-    for i in range(6):
-        s = b[i]
-        for k in range(i):
-            s -= L[i, k] * x[k]
-        x[i] = s / L[i, i]
-    for i in range(5, -1, -1):
-        s = x[i]
-        for k in range(i + 1, 6):
-            s -= L[k, i] * x[k]
-        x[i] = s / L[i, i]
-    return True
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _turn(Q, w0, w1, w2, out):
-    """Q · exp([w]×) into `out`."""
-    angle = math.sqrt(w0 * w0 + w1 * w1 + w2 * w2)
-    if angle < 1e-12:
-        a, b = 1.0, 0.5
-    else:
-        a, b = math.sin(angle) / angle, (1 - math.cos(angle)) / (angle * angle)
-    e00, e11, e22 = 1 - b * (w1 * w1 + w2 * w2), 1 - b * (w0 * w0 + w2 * w2), 1 - b * (w0 * w0 + w1 * w1)
-    e01, e10 = b * w0 * w1 - a * w2, b * w0 * w1 + a * w2
-    e02, e20 = b * w0 * w2 + a * w1, b * w0 * w2 - a * w1
-    e12, e21 = b * w1 * w2 - a * w0, b * w1 * w2 + a * w0
-    for i in range(3):
-        q0, q1, q2 = Q[i, 0], Q[i, 1], Q[i, 2]
-        out[i, 0] = q0 * e00 + q1 * e10 + q2 * e20
-        out[i, 1] = q0 * e01 + q1 * e11 + q2 * e21
-        out[i, 2] = q0 * e02 + q1 * e12 + q2 * e22
-
-
-@njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def take_templates(X, Q, shape, want, levels, masks, P, templates, usable):
-    """Take templates of patches in the cameras where `want` is 1.
-
-    Parameters
-    ----------
-    X, Q : (N, 3), (N, 3, 3) float
-        Places of the patches.
-    shape : (N, M, 5) float
-        Samples in the patch's frame and slopes of the surface: s, t, z, z_s, z_t.
-    want : (N, C) uint8
-        Set to 0 where too little is seen or the texture is too weak.
-    levels : (L, C, H, W) float32
-    masks : (C, H, W) uint8
-    P : (C, 3, 4) float
-    templates : (N, C, L, M, 3) float32
-        Filled with grey level and its slopes along s and t, per metre.
-    usable : (N, C, M) uint8
-        Filled with 1 where the sample was seen.
-    """
-    N, C = want.shape
-    L = levels.shape[0]
-    H, W = masks.shape[1:]
-    M = shape.shape[1]
-    for n in prange(N):
-        A = np.empty((3, 4))
-        for c in range(C):
-            if not want[n, c]:
-                continue
-            _local_camera(P[c], X[n], Q[n], A)
-            count, total, square = 0, 0.0, 0.0
-            for q in range(M):
-                usable[n, c, q] = 0
-                s, t, z, zs, zt = shape[n, q, 0], shape[n, q, 1], shape[n, q, 2], shape[n, q, 3], shape[n, q, 4]
-                w = A[2, 0] * s + A[2, 1] * t + A[2, 2] * z + A[2, 3]
-                if w <= 0:
-                    continue
-                x = (A[0, 0] * s + A[0, 1] * t + A[0, 2] * z + A[0, 3]) / w
-                y = (A[1, 0] * s + A[1, 1] * t + A[1, 2] * z + A[1, 3]) / w
-                if not (x >= 1 and y >= 1 and x < W - 2 and y < H - 2):
-                    continue
-                if masks[c, int(y + 0.5), int(x + 0.5)] == 0:
-                    continue
-                usable[n, c, q] = 1
-                count += 1
-                # derivatives of the pixel by s, t, z
-                xs, ys = (A[0, 0] - x * A[2, 0]) / w, (A[1, 0] - y * A[2, 0]) / w
-                xt, yt = (A[0, 1] - x * A[2, 1]) / w, (A[1, 1] - y * A[2, 1]) / w
-                xz, yz = (A[0, 2] - x * A[2, 2]) / w, (A[1, 2] - y * A[2, 2]) / w
-                for level in range(L):
-                    image = levels[level, c]
-                    value = _bilinear(image, x, y)
-                    gx = _bilinear(image, x + 0.5, y) - _bilinear(image, x - 0.5, y)
-                    gy = _bilinear(image, x, y + 0.5) - _bilinear(image, x, y - 0.5)
-                    templates[n, c, level, q, 0] = value
-                    templates[n, c, level, q, 1] = gx * (xs + zs * xz) + gy * (ys + zs * yz)
-                    templates[n, c, level, q, 2] = gx * (xt + zt * xz) + gy * (yt + zt * yz)
-                value = templates[n, c, L - 1, q, 0]
-                total += value
-                square += value * value
-            if count < LEAST_SAMPLES * M or square / count - (total / count) ** 2 < _LEAST_VARIANCE:
-                want[n, c] = 0
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
@@ -222,7 +98,7 @@ def _prepare(A, center, shape, template, usable, mask, use_mask, with_slopes, sa
             for r in range(6):
                 J[i, r] -= mean_j[r]
                 along[r] += J[i, r] * T[i]
-    if variance < _LEAST_VARIANCE * count:
+    if variance < LEAST_VARIANCE * count:
         return 0
     if with_slopes:
         for i in range(count):
@@ -246,7 +122,7 @@ def _compare(A, shape, image, samples, count, with_slopes, J, T, b):
         y = (A[1, 0] * s + A[1, 1] * t + A[1, 2] * z + A[1, 3]) * w
         x = min(max(x, 0.0), W - 1.001)
         y = min(max(y, 0.0), H - 1.001)
-        value = _bilinear(image, x, y)
+        value = bilinear(image, x, y)
         total += value
         square += value * value
         product += value * T[i]
@@ -346,7 +222,7 @@ def align_patches(
             correlation[n, c] = -1.0
             if not use[n, c]:
                 continue
-            _local_camera(P[c], x_n, q_n, A[c])
+            local_camera(P[c], x_n, q_n, A[c])
             for r in range(3):
                 local[r] = 0.0
                 for k in range(3):
@@ -385,7 +261,7 @@ def align_patches(
                 if counts[c] == 0:
                     continue
                 if step > 0:
-                    _local_camera(P[c], x_n, q_n, A[c])
+                    local_camera(P[c], x_n, q_n, A[c])
                 product, variance = _compare(
                     A[c], shape[n], images[c], samples[c], counts[c], iterations > 0, J[c], T[c], b[c]
                 )
@@ -434,7 +310,7 @@ def align_patches(
                         away += 0.5 * (q_n[k, j] * prior_Q[n, k, i] - q_n[k, i] * prior_Q[n, k, j])
                 N6[r, r] += 1 / (sd * sd)
                 r6[r] += away / (sd * sd)
-            if not _cholesky_solve(N6, r6, L6, x6):
+            if not solve_normal(N6, r6, L6, x6):
                 break
             if last or step == iterations:
                 break
@@ -443,7 +319,7 @@ def align_patches(
             scale = min(1.0, 4 * size[n] / max(shift, 1e-12), 0.3 / max(turn, 1e-12))
             for r in range(3):
                 x_n[r] += scale * (q_n[r, 0] * x6[0] + q_n[r, 1] * x6[1] + q_n[r, 2] * x6[2])
-            _turn(q_n, scale * x6[3], scale * x6[4], scale * x6[5], q_new)
+            turn_by(q_n, scale * x6[3], scale * x6[4], scale * x6[5], q_new)
             q_n[:] = q_new
             last = shift < 0.01 * size[n] and turn < 1e-3
         X[n], Q[n] = best_x, best_q
@@ -451,5 +327,5 @@ def align_patches(
             for r in range(6):
                 for k in range(6):
                     r6[k] = 1.0 if k == r else 0.0
-                if _cholesky_solve(N6, r6, L6, x6):
+                if solve_normal(N6, r6, L6, x6):
                     covariance[n, r] = x6[r]

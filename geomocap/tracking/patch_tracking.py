@@ -15,6 +15,7 @@ from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.patch_motion import carried, extrapolate, image_flow, lift_flow, nearest
 from geomocap.tracking.patches import Alignment, Patches, align, facings, visible, with_templates
 from geomocap.tracking.seeding import seed_patches, seed_spacing
+from geomocap.tracking.track_record import TrackRecord
 from geomocap.tracking.tracking_settings import TrackingSettings
 from geomocap.tracking.trajectories import (
     APART,
@@ -66,6 +67,11 @@ class Followed:
         N = len(patches)
         rest = np.zeros((N, 3))
         return cls(patches, identity, rest, rest.copy(), np.zeros(N, int), np.zeros(N, int))
+
+    @property
+    def last_reason(self) -> np.ndarray:
+        """Why each patch isn't measured now, (N,) int; `LAST_FRAME` (0) where it is."""
+        return np.where(self.gap > 0, self.reason, LAST_FRAME)
 
     def select(self, which: np.ndarray) -> Followed:
         """Return some of them, by a mask or by positions."""
@@ -127,7 +133,7 @@ def track_surface(
         with threads(1) as own:
             return track_surface(frames, n_frames, settings, progress, own)
     rng = np.random.default_rng(settings.seed)
-    record = _Record(n_frames)
+    record = TrackRecord(n_frames)
     spacing = 0.0
     state: Followed | None = None
     seeds: dict[int, Followed] = {}
@@ -143,12 +149,12 @@ def track_surface(
             fresh = Followed.begin(seed_patches(view, taken, spacing, settings, rng), np.zeros(0, int))
             fresh = Followed.begin(fresh.patches, np.arange(count, count + len(fresh.patches)))
             count += len(fresh.patches)
-            record.placed(k, fresh)
+            record.placed(k, fresh.identity, fresh.patches)
             state = fresh if state is None else state.join(fresh)
             seeds[k] = _bare(fresh)
         previous = view
     if state is not None:
-        record.ended(state, forward=True)
+        record.ended(state.identity, state.last_reason, forward=True)
     if settings.backward and max((k for k, s in seeds.items() if len(s.patches)), default=0) > 0:
         last = max(k for k, s in seeds.items() if len(s.patches))
         state = previous = None
@@ -160,7 +166,7 @@ def track_surface(
                 state = fresh if state is None else state.join(fresh)
             previous = view
         if state is not None:
-            record.ended(state, forward=False)
+            record.ended(state.identity, state.last_reason, forward=False)
     return record.trajectories(count)
 
 
@@ -199,7 +205,7 @@ def _next(
     previous: FrameViews,
     view: FrameViews,
     settings: TrackingSettings,
-    record: _Record,
+    record: TrackRecord,
     frame: int,
     forward: bool,
 ) -> Followed:
@@ -227,7 +233,7 @@ def _next(
         reason,
     )
     lost = gap > settings.longest_gap
-    record.ended(state.select(lost), forward)
+    record.ended(state.identity[lost], reason[lost], forward)
     return state.select(~lost)
 
 
@@ -356,54 +362,3 @@ def _new_views(patches: Patches, sure: np.ndarray, view: FrameViews, settings: T
     want = visible(patches, patches.positions, patches.frames, view, slack, _FACING) & ~patches.has
     want &= (cosine > _NEW_TEMPLATE_FACING) & sure[:, None]
     return with_templates(patches, want, view) if want.any() else patches
-
-
-class _Record:
-    """Collects what was measured, frame by frame."""
-
-    def __init__(self, n_frames: int) -> None:
-        self.n_frames = n_frames
-        self._measured: list[tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
-        self._placed: list[tuple[int, np.ndarray, np.ndarray]] = []
-        self._ends: list[tuple[bool, np.ndarray, np.ndarray]] = []
-
-    def measured(self, frame: int, identity: np.ndarray, found: Alignment, rows: np.ndarray) -> None:
-        self._measured.append(
-            (
-                frame,
-                identity,
-                found.positions[rows],
-                found.frames[rows],
-                found.sigma[rows],
-                found.correlation[rows],
-                found.n_views[rows],
-            )
-        )
-
-    def placed(self, frame: int, seeds: Followed) -> None:
-        p = seeds.patches
-        one = np.ones(len(p))
-        self._placed.append((frame, seeds.identity, p.frames))
-        views = p.has.sum(axis=1)
-        self._measured.append((frame, seeds.identity, p.positions, p.frames, 0.1 * p.size, one, views))
-
-    def ended(self, state: Followed, forward: bool) -> None:
-        self._ends.append((forward, state.identity, np.where(state.gap > 0, state.reason, LAST_FRAME)))
-
-    def trajectories(self, count: int) -> Trajectories:
-        T = self.n_frames
-        positions, rotations = np.full((count, T, 3), np.nan), np.full((count, T, 3, 3), np.nan)
-        sigma, correlation = np.full((count, T), np.nan), np.full((count, T), np.nan)
-        n_views = np.zeros((count, T), int)
-        first, placed = np.zeros((count, 3, 3)), np.zeros(count, int)
-        for frame, identity, frames in self._placed:
-            first[identity], placed[identity] = frames, frame
-        for frame, identity, X, Q, sd, r, views in self._measured:
-            positions[identity, frame] = X
-            rotations[identity, frame] = Q @ np.swapaxes(first[identity], 1, 2)
-            sigma[identity, frame], correlation[identity, frame] = sd, r
-            n_views[identity, frame] = views
-        end, begin = np.full(count, LAST_FRAME), np.full(count, LAST_FRAME)
-        for forward, identity, reason in self._ends:
-            (end if forward else begin)[identity] = reason
-        return Trajectories(positions, rotations, sigma, correlation, n_views, first[:, :, 2], placed, end, begin)

@@ -7,7 +7,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from geomocap.tracking.frame_views import FrameViews
-from geomocap.tracking.patch_kernel import align_patches, take_templates
+from geomocap.tracking.patch_kernel import align_patches
+from geomocap.tracking.patch_templates import take_templates
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,80 @@
+"""The record of tracking: what was measured of which patch in which frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geomocap.tracking.patches import Alignment, Patches
+from geomocap.tracking.trajectories import LAST_FRAME, Trajectories
+
+_PLACED_PX = 0.1
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """Patches measured in one frame."""
+
+    frame: int
+    identity: np.ndarray
+    positions: np.ndarray
+    frames: np.ndarray
+    sigma: np.ndarray
+    correlation: np.ndarray
+    n_views: np.ndarray
+
+
+class TrackRecord:
+    """Collects what was measured, frame by frame, and makes trajectories of it."""
+
+    def __init__(self, n_frames: int) -> None:
+        self.n_frames = n_frames
+        self._measured: list[_Measured] = []
+        self._placed: list[tuple[int, np.ndarray, np.ndarray]] = []
+        self._ends: list[tuple[bool, np.ndarray, np.ndarray]] = []
+
+    def measured(self, frame: int, identity: np.ndarray, found: Alignment, rows: np.ndarray) -> None:
+        """Keep what was found of patches `identity` (A,), which are the `rows` (A,) of an alignment."""
+        self._measured.append(
+            _Measured(
+                frame,
+                identity,
+                found.positions[rows],
+                found.frames[rows],
+                found.sigma[rows],
+                found.correlation[rows],
+                found.n_views[rows],
+            )
+        )
+
+    def placed(self, frame: int, identity: np.ndarray, patches: Patches) -> None:
+        """Keep new patches: their templates fit themselves, to a tenth of a pixel."""
+        self._placed.append((frame, identity, patches.frames))
+        views = patches.has.sum(axis=1)
+        one = np.ones(len(patches))
+        sigma = _PLACED_PX * patches.size
+        self._measured.append(_Measured(frame, identity, patches.positions, patches.frames, sigma, one, views))
+
+    def ended(self, identity: np.ndarray, reason: np.ndarray, forward: bool) -> None:
+        """Keep why patches are followed no further."""
+        self._ends.append((forward, identity, reason))
+
+    def trajectories(self, count: int) -> Trajectories:
+        """Return all `count` trajectories."""
+        T = self.n_frames
+        positions, rotations = np.full((count, T, 3), np.nan), np.full((count, T, 3, 3), np.nan)
+        sigma, correlation = np.full((count, T), np.nan), np.full((count, T), np.nan)
+        n_views = np.zeros((count, T), int)
+        first, placed = np.zeros((count, 3, 3)), np.zeros(count, int)
+        for frame, identity, frames in self._placed:
+            first[identity], placed[identity] = frames, frame
+        for m in self._measured:
+            positions[m.identity, m.frame] = m.positions
+            rotations[m.identity, m.frame] = m.frames @ np.swapaxes(first[m.identity], 1, 2)
+            sigma[m.identity, m.frame], correlation[m.identity, m.frame] = m.sigma, m.correlation
+            n_views[m.identity, m.frame] = m.n_views
+        end, begin = np.full(count, LAST_FRAME), np.full(count, LAST_FRAME)
+        for forward, identity, reason in self._ends:
+            (end if forward else begin)[identity] = reason
+        return Trajectories(positions, rotations, sigma, correlation, n_views, first[:, :, 2], placed, end, begin)
