@@ -39,7 +39,7 @@ def test_keypoints_move_with_the_surface_around_them(tmp_path):
     saved = run.read_npz("keypoints.npz")
     assert saved["names"].tolist() == ["wrist", "heel"] and saved["radius"].tolist() == [0.05, 0.05]
     truth = np.einsum("tij,kj->tki", turns, [[0.1, 0, 0], [-0.1, 0, 0.3]]) + shifts[:, None]
-    np.testing.assert_allclose(saved["positions"], truth, atol=1e-9)
+    np.testing.assert_allclose(saved["positions"], truth, atol=1e-5)  # the robust fit weighs, and is regular
 
 
 @pytest.mark.parametrize(
