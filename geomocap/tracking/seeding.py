@@ -123,10 +123,12 @@ def seed_patches(
     """
     M, C, L = (2 * settings.radius_px + 1) ** 2, view.count, len(view.levels)
     patches = Patches.empty(M, C, L)
+    tree = cKDTree(view.surface)
     tried = np.zeros(len(view.surface), bool)
     for _ in range(_ROUNDS):
         candidates = np.flatnonzero(~tried)
-        there = np.concatenate([taken, patches.positions])
+        # a hull stands off the true surface: what is there already counts where it shows on the hull
+        there = view.surface[tree.query(np.concatenate([taken, patches.positions]))[1]]
         chosen = candidates[spread(view.surface[candidates], spacing, there, rng)]
         if not len(chosen):
             break

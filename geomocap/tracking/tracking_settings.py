@@ -10,7 +10,7 @@ from geomocap.settings import Settings
 class TrackingSettings(Settings):
     """How patches of the surface are placed and followed."""
 
-    n_patches: int = Field(1500, ge=10, le=100_000, description="Patches placed on a frame's whole surface")
+    n_patches: int = Field(2000, ge=10, le=100_000, description="Patches placed on a frame's whole surface")
     radius_px: int = Field(5, ge=2, le=20, description="Half the width of a patch (pixels)")
     blurs_px: tuple[float, float] = Field((2.5, 0.8), description="Blur of the coarse and the fine level (pixels)")
     seed_every: int = Field(10, ge=1, description="Frames between two looks for surface without patches")
