@@ -17,6 +17,7 @@ _TIP_QUANTILE = 0.8
 _TURN_SHARE = 0.02
 _LEAST_SEEN = 0.1
 _LEAST_FRAMES = 5
+_FEIGNED = 1.0
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,10 @@ def judge(body: int, model: BodyModel, evidence: Evidence, criterion: Criterion)
     # the samples that are most clearly this body's own: it must have a core, not only a gradual change
     own = np.argsort(by_itself - by_others, kind="stable")[: max(5, int(_CORE * len(members)))]
     gain = by_others[own].mean() - by_itself[own].mean()
-    excess = float(np.arctan2(np.sqrt(max(gain, 0.0)), max(radius, 1e-9)))
+    # what the standard deviation of the positions could feign is no evidence
+    sigma = float(np.sqrt((evidence.sigma[members] ** 2).mean()))
+    excess = float(np.arctan2(np.sqrt(max(gain - (_FEIGNED * sigma) ** 2, 0.0)), max(radius, 1e-9)))
+    turn = max(turn - float(np.arctan2(_FEIGNED * sigma, max(radius, 1e-9))), 0.0)
     by_turn, by_excess = turn / criterion.min_turn, excess / criterion.min_excess
     return Candidate(body, min(by_turn, by_excess), into if by_turn < by_excess else -1, turn, excess)
 

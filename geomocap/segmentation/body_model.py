@@ -27,6 +27,8 @@ class Evidence:
     weights : (N, T) float
         0 where not seen (filled by neighbours).
     seen : (N, T) bool
+    sigma : (N,) float, metres
+        Standard deviation of the positions as their source states it; 0: not stated.
     rest : (N, 3) float, metres
         Positions in the reference.
     certain : (N,) bool
@@ -50,6 +52,7 @@ class Evidence:
     positions: np.ndarray
     weights: np.ndarray
     seen: np.ndarray
+    sigma: np.ndarray
     rest: np.ndarray
     certain: np.ndarray
     turns: np.ndarray

@@ -164,7 +164,7 @@ def find_motion_bodies(
     progress(_STAGE, 2, 4)
     # Too many bodies
     certain = np.full(paths.count, True) if paths.reference is not None else paths.seen[:, 0]
-    evidence = _evidence(positions, weights, paths.seen, reference, certain, turns, graph, extent, settings)
+    evidence = _evidence(positions, weights, paths, reference, certain, turns, graph, extent, settings)
     linkage = connected_linkage(turns, graph.neighbours)
     least = max(6, round(settings.min_share * paths.count))
     label = absorb_small(linkage.cut(np.deg2rad(settings.first_cut_deg)), turns, graph, least)
@@ -194,7 +194,7 @@ def _known_rotations(paths: MotionPaths, fitted: np.ndarray) -> np.ndarray:
 def _evidence(
     positions: np.ndarray,
     weights: np.ndarray,
-    seen: np.ndarray,
+    paths: MotionPaths,
     rest: np.ndarray,
     certain: np.ndarray,
     turns: np.ndarray,
@@ -206,7 +206,8 @@ def _evidence(
     return Evidence(
         positions,
         weights,
-        seen,
+        paths.seen,
+        paths.typical_sigma(),
         rest,
         certain,
         turns,

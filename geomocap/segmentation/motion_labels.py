@@ -10,6 +10,8 @@ from geomocap.segmentation.motion_paths import MotionPaths
 
 _VOTERS = 12
 _NEAREST = 3
+_PLANE = 8
+_THICKNESS = 0.35
 _CHUNK = 65536
 
 
@@ -17,8 +19,9 @@ def label_points(bodies: MotionBodies, paths: MotionPaths, frame: int, points: n
     """Body of each point of a frame.
 
     The nearest samples of the frame propose bodies, with votes by distance. A body that is proposed must also fit: the
-    point is carried back to frame 0 by the body's motion, and its distance from the body's own samples there counts
-    against it. A hand at rest on a hip gets few votes inside the hip, and points beside it do not fit the hand's shape.
+    point is carried back to frame 0 by the body's motion, and its distance from the body's own samples there, and still
+    more from the surface through them, counts against it. A hand at rest on a hip gets few votes inside the hip, and
+    points beside it do not fit the hand's shape.
 
     Parameters
     ----------
@@ -39,12 +42,20 @@ def label_points(bodies: MotionBodies, paths: MotionPaths, frame: int, points: n
     trust = np.where(paths.seen[:, frame], 1.0, 0.3)
     spacing = float(np.median(cKDTree(bodies.rest).query(bodies.rest, 2)[0][:, 1]))
     shapes = [cKDTree(bodies.rest[bodies.label == b]) for b in range(bodies.body_count)]
+    normals = [_normals(shape) for shape in shapes]
     tree = cKDTree(samples)
     parts = [
-        _label_some(bodies, frame, points[i : i + _CHUNK], tree, trust, shapes, spacing)
+        _label_some(bodies, frame, points[i : i + _CHUNK], tree, trust, shapes, normals, spacing)
         for i in range(0, len(points), _CHUNK)
     ]
     return np.concatenate(parts)
+
+
+def _normals(shape: cKDTree) -> np.ndarray:
+    """Normals of a body's surface at its samples, (n, 3), of either sign."""
+    around = shape.data[shape.query(shape.data, min(_PLANE, shape.n))[1].reshape(shape.n, -1)]
+    around = around - around.mean(axis=1, keepdims=True)
+    return np.linalg.eigh(np.einsum("nkc,nkd->ncd", around, around))[1][:, :, 0]
 
 
 def _label_some(
@@ -54,6 +65,7 @@ def _label_some(
     tree: cKDTree,
     trust: np.ndarray,
     shapes: list[cKDTree],
+    normals: list[np.ndarray],
     spacing: float,
 ) -> np.ndarray:
     voters = min(_VOTERS, tree.n)
@@ -71,6 +83,10 @@ def _label_some(
             continue
         back = (points[proposed] - bodies.translations[frame, b]) @ bodies.rotations[frame, b]
         k = min(_NEAREST, shapes[b].n)
-        away = shapes[b].query(back, k)[0].reshape(len(back), k).mean(axis=1)
-        score[proposed, b] *= np.exp(-0.5 * (away / (2.0 * spacing)) ** 2) + 1e-6
+        distances, nearest = shapes[b].query(back, k)
+        distances, nearest = distances.reshape(len(back), k), nearest.reshape(len(back), k)
+        offsets = back[:, None] - shapes[b].data[nearest]
+        above = np.abs(np.einsum("mkc,mkc->mk", offsets, normals[b][nearest])).mean(axis=1)
+        misfit = (distances.mean(axis=1) / (2.0 * spacing)) ** 2 + (above / (_THICKNESS * spacing)) ** 2
+        score[proposed, b] *= np.exp(-0.5 * misfit) + 1e-6
     return score.argmax(axis=1).astype(np.int32)

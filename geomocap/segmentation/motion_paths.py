@@ -72,6 +72,14 @@ class MotionPaths:
         fullest = int(np.argmax(self.seen.sum(axis=0)))
         return float(np.linalg.norm(np.ptp(self.positions[self.seen[:, fullest], fullest], axis=0)))
 
+    def typical_sigma(self) -> np.ndarray:
+        """Standard deviation of each sample's positions, (N,) float, metres: median over the frames; 0: not stated."""
+        if self.sigma is None:
+            return np.zeros(self.count)
+        given = np.asarray(self.sigma, float).reshape(self.count, -1)
+        stated = np.where(np.isfinite(given), given, 0.0)
+        return np.median(stated, axis=1)
+
     def weights(self) -> np.ndarray:
         """Weight of each position, (N, T) float: relative to the median variance, between 0 and 4; 0 where not seen."""
         if self.sigma is None:
