@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomocap.errors import GeometryError
 from geomocap.geometry import BodyPoints, Geometry
 from geomocap.pipeline.job import Job
 from geomocap.run import Run
@@ -69,15 +68,7 @@ def _paths(job: Job, geometry: Geometry) -> tuple[MotionPaths, str]:
         if len(chosen) >= LEAST_SAMPLES and coverage >= LEAST_COVERAGE:
             return MotionPaths(positions, sigma=_filled(tracked["sigma"][chosen])), "patches"
     nodes = track_nodes(geometry.points, len(geometry), job.config.nodes, geometry.features, job.progress, job.executor)
-    followed = np.isfinite(nodes.positions).all(axis=2).any(axis=1)
-    if not followed.any():
-        raise GeometryError("no node of the surface could be followed; are the frames one subject in motion?")
-    return (
-        MotionPaths(
-            nodes.positions[followed], sigma=_filled(nodes.sigma[followed]), reference=nodes.reference[followed]
-        ),
-        "nodes",
-    )
+    return nodes.motion_paths(), "nodes"
 
 
 def _filled(sigma: np.ndarray) -> np.ndarray:
