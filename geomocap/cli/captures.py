@@ -24,7 +24,7 @@ from geomocap.cli.settings_options import with_options_of
 from geomocap.config import Config
 
 BUILT_IN: dict[str, Callable[[], AnimatedAsset]] = {"figure": figure, "mechanism": mechanism}
-DEMO = SynthesisSettings(cameras=6, width=320, height=240, fps=15, frames=30)
+DEMO = SynthesisSettings(cameras=8, width=320, height=240, fps=12, frames=24)
 
 
 @with_options_of(SynthesisSettings)
