@@ -3,8 +3,8 @@
 A key-point is a centre and a radius at one frame. It moves with the trajectories inside (D'Apuzzo 2003: by their mean
 displacement); here by the rigid motion that fits them best, which is their mean displacement for a point amid them
 and right for one at their side, and robustly, so that a single drifting trajectory has no say. Trajectories that come
-into the region later take part from then on. Where none is measured inside, the body that the point sits on (all within
-three radii) bridges the gap, and the frame is marked.
+into the region later take part from then on if they move alike: an arm that swings past a hip doesn't. Where none is
+measured inside, the body that the point sits on (all within three radii) bridges the gap, and the frame is marked.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from geomocap.tracking.trajectories import Trajectories
 
 _BODY = 3.0  # radii within which trajectories bridge gaps
 _LEAST = 3  # trajectories that a rigid motion needs
+_OTHER = 0.03  # m; misfit from which a trajectory is taken for one of another body
+_ALIKE = 0.003  # m; largest shift within one frame, in the key-point's axes, of a trajectory that joins in
 _SCALE = 0.004  # m; misfit from which a trajectory counts less
 
 
@@ -85,6 +87,7 @@ def _follow(
     # places of trajectories in the key-point's own axes, and whether they were there from the beginning
     local = np.full((N, 3), np.nan)
     first = np.zeros(N, bool)
+    before = np.full((N, 3), np.nan)
     for t in order:
         x = tracks.positions[:, t]
         seen = tracks.measured[:, t]
@@ -106,9 +109,14 @@ def _follow(
                 count[t] = int(voters.sum())
         if moved:
             positions[t] = place
-            near = seen & ~np.isfinite(local[:, 0])
-            near[near] = np.linalg.norm(x[near] - place, axis=1) <= _BODY * radius
-            local[near] = (x[near] - place) @ turn
+            here = (x - place) @ turn
+            # who has come to move otherwise sits on another body; who moves alike and is near takes part
+            with np.errstate(invalid="ignore"):
+                local[np.linalg.norm(here - local, axis=1) > _OTHER] = np.nan
+                near = ~np.isfinite(local[:, 0]) & (np.linalg.norm(here, axis=1) <= _BODY * radius)
+                near &= (np.linalg.norm(here - before, axis=1) < _ALIKE) | (t == order[0])
+            local[near] = here[near]
+            before = here
             if t == order[0]:
                 first |= near
                 count[t] = int((near & (np.linalg.norm(np.nan_to_num(local), axis=1) <= radius)).sum())

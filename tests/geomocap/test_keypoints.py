@@ -68,6 +68,15 @@ def test_tracks_that_come_later_take_over():
     assert not paths.bridged.any()
 
 
+def test_a_limb_that_passes_by_has_no_say():
+    body = rigid_tracks(cloud(60), 20, SHIFT, TURN)
+    limb = cloud(60, 1, 0.04)[:, None] + (np.arange(20)[None, :, None] - 10) * np.array([0.03, 0, 0])
+    limb = limb + truth(np.zeros(3), 20)[None]
+    both = make_tracks(np.concatenate([body.positions, limb]))
+    paths = follow_keypoints(both, np.zeros((1, 3)), np.array([0.05]), 0)
+    assert_allclose(paths.positions[:, 0], truth(np.zeros(3), 20), atol=1e-4)
+
+
 def test_nothing_near_is_nan():
     tracks = rigid_tracks(cloud(), 5, SHIFT, TURN)
     paths = follow_keypoints(tracks, np.array([[3.0, 0, 0]]), np.array([0.05]), 0)
