@@ -72,6 +72,7 @@ def test_a_limb_that_passes_by_has_no_say():
     body = rigid_tracks(cloud(60), 20, SHIFT, TURN)
     limb = cloud(60, 1, 0.04)[:, None] + (np.arange(20)[None, :, None] - 10) * np.array([0.03, 0, 0])
     limb = limb + truth(np.zeros(3), 20)[None]
+    limb[:, :10] = np.nan  # seen for the first time before the region
     hidden = body.positions.copy()
     inside = np.linalg.norm(hidden[:, 0], axis=1) < 0.05
     hidden[np.ix_(inside, np.arange(8, 14))] = np.nan  # behind the limb
