@@ -88,15 +88,6 @@ def classify(P, size, subject, seen, unseen, c, x, y, z, dx, dy, dz):
     return BACKGROUND if inside and visible == area else MIXED
 
 
-@njit(cache=True, nogil=True)
-def _fill(bits, i0, i1, j0, j1, k0, k1):
-    """Set the bits of a box that lies within one word along z."""
-    word = np.uint32(((1 << (k1 - k0)) - 1) << (k0 & 31))
-    for i in range(i0, i1):
-        for j in range(j0, j1):
-            bits[i, j, k0 >> 5] |= word
-
-
 @njit(cache=True, nogil=True, parallel=True)
 def carve(P, size, masks, valid, subject, seen, unseen, tolerance, min_views, origin, edge, Z, bits):
     """Carve all blocks, one a task, each depth first.

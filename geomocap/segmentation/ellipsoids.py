@@ -156,19 +156,10 @@ def eigen_axes(moments: np.ndarray, variances: np.ndarray, axes: np.ndarray) -> 
 
 
 @njit(cache=True, nogil=True)
-def error_sum(points: np.ndarray, start: int, end: int, moments: np.ndarray) -> float:
-    """Sum of eq. 2's terms over points[start:end] against the ellipsoid of `moments`, without the factor 1/N."""
-    variances = np.empty(3)
-    axes = np.empty((3, 3))
-    eigen_axes(moments, variances, axes)
-    return error_terms(points, start, end, moments, variances, axes)
-
-
-@njit(cache=True, nogil=True)
 def error_terms(
     points: np.ndarray, start: int, end: int, moments: np.ndarray, variances: np.ndarray, axes: np.ndarray
 ) -> float:
-    """Sum of eq. 2's terms with the axes given, see `error_sum`."""
+    """Sum of eq. 2's terms over points[start:end] against an ellipsoid with these axes, without the factor 1/N."""
     cx, cy, cz = moments[1] / moments[0], moments[2] / moments[0], moments[3] / moments[0]
     s0 = 1.0 / (SHELL * variances[0])
     s1 = 1.0 / (SHELL * variances[1])
