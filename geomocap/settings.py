@@ -44,4 +44,6 @@ def check_settings(model: type[Model], values: dict[str, Any], where: str = "") 
         start = f"{where}: " if where else ""
         if first["type"] == "extra_forbidden":
             raise SettingsError(f"{start}unknown setting {key}; --help of the command lists them all") from None
+        if not first["loc"]:
+            raise SettingsError(f"{start}{first['msg'].removeprefix('Value error, ')}") from None
         raise SettingsError(f"{start}setting {key} = {first['input']!r}: {first['msg']}") from None

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 import typer
 
 import geomocap
@@ -14,16 +13,14 @@ from geomocap.cli import captures
 from geomocap.cli.calibrate import calibrate
 from geomocap.cli.evaluate import evaluate
 from geomocap.cli.execution import Scheduler, Workers
-from geomocap.cli.export import export, report_exported
+from geomocap.cli.export import export
 from geomocap.cli.info import info
 from geomocap.cli.jobs import CaptureFolder, RunFolder, capture_job, scans_job
+from geomocap.cli.keypoints import keypoints
 from geomocap.cli.progress import progress_bars
 from geomocap.cli.reports import capture_of, console, review_job, tell_results
 from geomocap.cli.settings_options import with_settings
 from geomocap.config import Config
-from geomocap.export.run_export import export_run
-from geomocap.pipeline.keypoints import keypoints as follow_keypoints
-from geomocap.pipeline.keypoints import read_keypoints
 from geomocap.run import Run
 from viz.files import render_file
 from viz.review import review as review_files
@@ -100,30 +97,6 @@ def track(
 
 
 @app.command()
-def keypoints(
-    run: RunFolder,
-    points: Annotated[
-        Path | None,
-        typer.Option("--points", metavar="FILE.toml", help="Key-points; RUN/keypoints.toml if not given."),
-    ] = None,
-) -> None:
-    """Follow key-points on the surface, given as `[[keypoint]]` tables: name, center (m), radius (m), frame.
-
-    Writes keypoints.npz, and the motion files anew with the key-points as markers.
-    """
-    wanted = read_keypoints(points or run / "keypoints.toml")
-    found = follow_keypoints(Run(run), wanted)
-    for k, point in enumerate(wanted):
-        followed = int(np.isfinite(found.positions[:, k, 0]).sum())
-        bridged = int(found.bridged[:, k].sum())
-        console.print(
-            f"{point.name}: followed in {followed} of {len(found.positions)} frames, {bridged} of them bridged"
-        )
-    if (run / "skeleton.npz").exists():
-        report_exported(export_run(Run(run)))
-
-
-@app.command()
 @with_settings("scans", *BODIES, "export")
 def segment(
     scans: Annotated[
@@ -195,6 +168,7 @@ app.command("import")(captures.import_)
 app.command()(captures.demo)
 app.command()(calibrate)
 app.command("convert-calibration")(captures.convert)
+app.command()(keypoints)
 app.command()(export)
 app.command()(evaluate)
 app.command()(info)

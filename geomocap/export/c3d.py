@@ -1,7 +1,8 @@
 """C3D, the format of motion laboratories: markers with residuals and the bodies' rotations, written and read.
 
-Axes z up (POINT:X_SCREEN and Y_SCREEN say so), millimetres. Gaps are invalid points (residual -1). Bodies stand as 4×4
-transforms in the ROTATION group, as Theia and Visual3D write them. Needs the package `ezc3d`.
+Axes z up (POINT:X_SCREEN and Y_SCREEN say so), millimetres. Gaps are invalid points (residual -1), points that were
+filled in have residual 0. Bodies stand as 4×4 transforms in the ROTATION group, as Theia and Visual3D write them.
+Needs the package `ezc3d`.
 """
 
 from __future__ import annotations

@@ -11,6 +11,8 @@ from geomocap.export.conventions import Axis
 from geomocap.export.errors import MotionError
 from geomocap.export.names import Names
 
+LEAST_RESIDUAL = 0.0001  # m; 0 stands for points that were not measured
+
 
 @dataclass(frozen=True)
 class Markers:
@@ -92,18 +94,23 @@ def markers_from_run(
     labels = list(names.joint_names(joint_bodies, body_names, _texts(skeleton, "joint_names")))
     told = [f"joint between {body_names[a]} and {body_names[b]}" for a, b in joint_bodies]
     positions = [joints.reshape(n_frames, -1, 3)]
+    residuals = [np.full((n_frames, len(labels)), np.nan)]
     if keypoints is not None:
-        labels += [str(n) for n in keypoints["names"]]
-        told += [f"key-point, radius {r * 1000:.0f} mm" for r in keypoints["radius"]]
-        positions.append(keypoints["positions"])
+        points = keypoint_markers(keypoints, float(skeleton["fps"]), up)
+        labels += points.names
+        told += points.descriptions or ()
+        positions.append(points.positions)
+        residuals.append(np.full(points.present.shape, np.nan) if points.residuals is None else points.residuals)
     if ellipsoids is not None:
         bodies = [body_names[b] if 0 <= b < n_bodies else "no body" for b in ellipsoids["body"].astype(int)]
         labels += [f"ellipsoid{k:03d}" for k in range(len(bodies))]
         told += [f"centre of an ellipsoid of {b}" for b in bodies]
         positions.append(ellipsoids["centers"])
+        residuals.append(np.full(ellipsoids["centers"].shape[:2], np.nan))
     if not labels:
         labels, told = list(body_names), ["centre of a body"] * n_bodies
         positions = [np.asarray(skeleton["body_positions"])]
+        residuals = [np.full(positions[0].shape[:2], np.nan)]
     lengths = {len(p) for p in positions}
     if len(lengths) > 1:
         raise MotionError(f"skeleton, key-points and ellipsoids have {sorted(lengths)} frames; run the stages again")
@@ -112,7 +119,35 @@ def markers_from_run(
         np.concatenate(positions, axis=1).astype(float),
         float(skeleton["fps"]),
         up,
+        np.concatenate(residuals, axis=1),
         descriptions=tuple(told),
+    )
+
+
+def keypoint_markers(keypoints: Mapping[str, np.ndarray], fps: float, up: Axis = "z") -> Markers:
+    """Return the key-points of `keypoints.npz` as markers.
+
+    Their residuals are the standard deviations, but not known in bridged frames: C3D has 0 there, as it is customary
+    for points that were not measured but filled in.
+
+    Parameters
+    ----------
+    keypoints : mapping
+        Arrays of `keypoints.npz`, of which only names, positions and radius must be there.
+    fps : float
+    up : "x", "y" or "z"
+    """
+    positions = np.asarray(keypoints["positions"], float)
+    residuals = None
+    if "std" in keypoints and "bridged" in keypoints:
+        residuals = np.where(keypoints["bridged"], np.nan, np.maximum(keypoints["std"], LEAST_RESIDUAL))
+    return Markers(
+        tuple(str(n) for n in keypoints["names"]),
+        positions,
+        fps,
+        up,
+        residuals,
+        tuple(f"key-point, radius {r * 1000:.0f} mm" for r in keypoints["radius"]),
     )
 
 

@@ -98,6 +98,10 @@ def _tracks(arrays: dict[str, np.ndarray], told: Description) -> None:
 
 def _keypoints(arrays: dict[str, np.ndarray], told: Description) -> None:
     told.fact("key-points", shortened([str(n) for n in arrays["names"]]))
+    present = np.isfinite(arrays["positions"]).all(axis=-1)
+    for k, name in enumerate(arrays["names"]):
+        if not present[:, k].all():
+            told.problem(f"key-point {name} has no position in {(~present[:, k]).sum()} of {len(present)} frames")
 
 
 def _stages(run: Run, told: Description) -> None:

@@ -1,90 +1,147 @@
-"""Key-points: regions that somebody placed on the surface, followed by the trajectories inside → `keypoints.npz`."""
+"""Key-points: regions that somebody placed on the surface, followed by the trajectories inside.
+
+Written as `keypoints.npz`, `keypoints.trc` and, where its package is installed, `keypoints.c3d`.
+"""
 
 from __future__ import annotations
 
-import tomllib
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field
 
-from geomocap.errors import RunError, SettingsError
+from geomocap.errors import RunError
+from geomocap.export.c3d import write_c3d
+from geomocap.export.errors import MissingPackageError
+from geomocap.export.markers import Markers, keypoint_markers
+from geomocap.export.run_export import run_up
+from geomocap.export.trc import write_trc
 from geomocap.run import Run
-from geomocap.settings import Settings, check_settings
-from geomocap.tracking.keypoints import KeyPointPaths, follow_keypoints
+from geomocap.tracking.keypoint_file import KeyPointFile, follow_regions
+from geomocap.tracking.keypoints import REACH, KeyPointPaths, Measured
+from geomocap.tracking.smoothing import SmoothingSettings, smooth_motion
 from geomocap.tracking.trajectories import LAST_FRAME, Trajectories
 
-
-class KeyPoint(Settings):
-    """A region on the subject."""
-
-    name: str = Field(min_length=1, description="name, unique")
-    center: tuple[float, float, float] = Field(description="centre in the frame `frame` (m, world)")
-    radius: float = Field(default=0.03, gt=0, description="radius of the region (m)")
-    frame: int = Field(default=0, ge=0, description="frame in which it was placed")
+# A key-point is a mean of trajectories and hardly noisy: a cubic keeps quick motion where a parabola flattens it.
+SMOOTHING = SmoothingSettings(half_width=3, degree=3)
 
 
-class KeyPointFile(Settings):
-    """What `keypoints.toml` holds: a table `[[keypoint]]` for each."""
+@dataclass(frozen=True)
+class FollowedKeyPoints:
+    """What was written: the paths, the files, and why one is missing."""
 
-    keypoint: tuple[KeyPoint, ...] = Field(min_length=1, description="the key-points")
-
-
-def read_keypoints(path: Path) -> tuple[KeyPoint, ...]:
-    """Read key-points from a TOML file.
-
-    Raises
-    ------
-    SettingsError
-        If it can't be read, a key is unknown, or a name stands twice.
-    """
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SettingsError(
-            f"{path}: can't be read ({error.strerror}); give key-points as [[keypoint]] tables"
-        ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path}: not valid TOML ({error})") from None
-    points = check_settings(KeyPointFile, values, str(path)).keypoint
-    names = [p.name for p in points]
-    twice = sorted({n for n in names if names.count(n) > 1})
-    if twice:
-        raise SettingsError(f"{path}: the name {twice[0]} stands twice; names must be unique")
-    return points
+    paths: KeyPointPaths
+    files: tuple[Path, ...]
+    skipped: tuple[str, ...] = ()
 
 
-def keypoints(run: Run, points: tuple[KeyPoint, ...]) -> KeyPointPaths:
-    """Follow key-points through a run's trajectories and write `keypoints.npz`.
+def keypoints(run: Run, file: KeyPointFile) -> FollowedKeyPoints:
+    """Follow key-points through a run's trajectories and write them.
 
     Raises
     ------
     RunError
-        If the run has no trajectories.
+        If the run has no trajectories, there are no key-points, one is placed in a frame that isn't there or where no
+        trajectories are, or the frame rate isn't known.
+    """
+    tracks = run_trajectories(run)
+    if not file.keypoint:
+        raise RunError(f"{run.path}: no key-points are given; add [[keypoint]] tables, or place them with --edit")
+    for p in file.keypoint:
+        if p.frame >= tracks.n_frames:
+            raise RunError(
+                f"key-point {p.name}: placed in frame {p.frame}, but {run.path} has frames 0 to {tracks.n_frames - 1}"
+            )
+    paths = follow_regions(Measured.of(tracks), file.keypoint)
+    for k, p in enumerate(file.keypoint):
+        if paths.n_tracks[p.frame, k] == 0:
+            reach = 1000 * REACH * p.radius
+            raise RunError(
+                f"key-point {p.name}: no trajectory within {reach:.0f} mm ({REACH:g} radii) of its centre in frame "
+                f"{p.frame}; move it onto the surface, enlarge it, or place it in a frame where trajectories run there"
+            )
+    return write_results(run, file, paths)
+
+
+def write_results(run: Run, file: KeyPointFile, paths: KeyPointPaths) -> FollowedKeyPoints:
+    """Write followed key-points as `keypoints.npz`, `.trc` and `.c3d`.
+
+    Raises
+    ------
+    RunError
+        If the frame rate isn't known, or a file can't be written.
+    """
+    fps = run_fps(run)
+    motion = smooth_motion(paths.positions.transpose(1, 0, 2), fps, settings=SMOOTHING)
+    names = file.names
+    arrays = {
+        "names": np.array(names),
+        "positions": paths.positions,
+        "radius": np.array([p.radius for p in file.keypoint]),
+        "bridged": paths.bridged,
+        "tracks": paths.n_tracks,
+        "std": paths.std,
+        "velocities": motion.velocities.transpose(1, 0, 2),
+        "accelerations": motion.accelerations.transpose(1, 0, 2),
+        "links": np.array([[names.index(n) for n in link] for link in file.links], int).reshape(-1, 2),
+        "fps": np.array(fps),
+    }
+    run.write_npz("keypoints.npz", **arrays)
+    markers = keypoint_markers(arrays, fps, run_up(run))
+    return FollowedKeyPoints(paths, *_write_motion(run, markers))
+
+
+def _write_motion(run: Run, markers: Markers) -> tuple[tuple[Path, ...], tuple[str, ...]]:
+    trc, c3d = run.path / "keypoints.trc", run.path / "keypoints.c3d"
+    write_trc(trc, markers)
+    try:
+        write_c3d(c3d, markers)
+    except MissingPackageError as error:
+        c3d.unlink(missing_ok=True)
+        return (run.path / "keypoints.npz", trc), (str(error),)
+    return (run.path / "keypoints.npz", trc, c3d), ()
+
+
+def run_fps(run: Run) -> float:
+    """Return a run's frames per second, as its record or its skeleton says.
+
+    Raises
+    ------
+    RunError
+        If neither does.
+    """
+    if (run.path / "run.toml").is_file():
+        fps = run.read_record().get("source", {}).get("fps")
+        if isinstance(fps, int | float) and fps > 0:
+            return float(fps)
+    if (run.path / "skeleton.npz").is_file() and "fps" in (arrays := run.read_npz("skeleton.npz")):
+        return float(arrays["fps"])
+    raise RunError(f"{run.path}: its frame rate isn't known; run.toml has no source.fps above 0")
+
+
+def run_trajectories(run: Run) -> Trajectories:
+    """Read a run's trajectories.
+
+    Raises
+    ------
+    RunError
+        If it has none.
     """
     if not (run.path / "tracks.npz").exists():
         raise RunError(f"{run.path}: has no tracks.npz; run `geomocap track CAPTURE {run.path}` first")
-    tracks = trajectories_of(run.read_npz("tracks.npz"))
-    T, K = tracks.n_frames, len(points)
-    positions, bridged, count = np.full((T, K, 3), np.nan), np.zeros((T, K), bool), np.zeros((T, K), int)
-    for frame in sorted({p.frame for p in points}):
-        placed = [k for k, p in enumerate(points) if p.frame == frame]
-        centers, radii = np.array([points[k].center for k in placed]), np.array([points[k].radius for k in placed])
-        found = follow_keypoints(tracks, centers, radii, frame)
-        positions[:, placed], bridged[:, placed], count[:, placed] = found.positions, found.bridged, found.n_tracks
-    run.write_npz(
-        "keypoints.npz",
-        names=np.array([p.name for p in points]),
-        positions=positions,
-        radius=np.array([p.radius for p in points]),
-        bridged=bridged,
-        tracks=count,
-    )
-    return KeyPointPaths(positions, bridged, count)
+    return trajectories_of(run.read_npz("tracks.npz"), run.path / "tracks.npz")
 
 
-def trajectories_of(arrays: dict[str, np.ndarray]) -> Trajectories:
-    """Make trajectories of the arrays of `tracks.npz`, of which only the positions must be there."""
+def trajectories_of(arrays: dict[str, np.ndarray], source: Path | str = "tracks.npz") -> Trajectories:
+    """Make trajectories of the arrays of `tracks.npz`, of which only the positions must be there.
+
+    Raises
+    ------
+    RunError
+        If they aren't.
+    """
+    if "positions" not in arrays or arrays["positions"].ndim != 3 or arrays["positions"].shape[2] != 3:
+        raise RunError(f"{source}: holds no array positions of shape (N, T, 3); run `geomocap track` again")
     positions = arrays["positions"]
     N, T = positions.shape[:2]
     nothing = np.zeros(N, int)
