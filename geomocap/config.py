@@ -19,7 +19,9 @@ from geomocap.settings import Settings, check_settings
 from geomocap.silhouettes import SilhouetteSettings
 from geomocap.skeleton.motion_skeleton import MotionSkeletonSettings
 from geomocap.skeleton.settings import SkeletonSettings
+from geomocap.tracking.filters import FilterSettings
 from geomocap.tracking.node_settings import NodeTrackingSettings
+from geomocap.tracking.smoothing import SmoothingSettings
 from geomocap.tracking.tracking_settings import TrackingSettings
 
 
@@ -33,6 +35,8 @@ class Config(Settings):
     segmentation: SegmentationSettings = Field(SegmentationSettings(), description="bodies")
     skeleton: SkeletonSettings = Field(SkeletonSettings(), description="joints and hierarchy")
     tracking: TrackingSettings = Field(TrackingSettings(), description="surface tracking in the images")
+    filters: FilterSettings = Field(FilterSettings(), description="filters of trajectories")
+    smoothing: SmoothingSettings = Field(SmoothingSettings(), description="velocities and accelerations")
     nodes: NodeTrackingSettings = Field(NodeTrackingSettings(), description="node tracking on the geometry")
     motion_bodies: MotionBodiesSettings = Field(MotionBodiesSettings(), description="bodies from motion paths")
     motion_skeleton: MotionSkeletonSettings = Field(MotionSkeletonSettings(), description="their joints")

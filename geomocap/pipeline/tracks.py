@@ -25,17 +25,17 @@ def tracks(job: Job) -> str:
     if capture is None:
         raise CaptureError("tracks need a capture")
     pictures = capture.fingerprint("images", "videos", "sparse")
-    key = stage_key("tracks", voxels(job), pictures, job.config.tracking.model_dump(), job.fps)
+    settings = {name: getattr(job.config, name).model_dump() for name in ("tracking", "filters", "smoothing")}
+    key = stage_key("tracks", voxels(job), pictures, settings, job.fps)
     return job.stage("tracks", key, ["tracks.npz"], lambda: _track(job, capture))
 
 
 def _track(job: Job, capture: Capture) -> int:
     read = _ReadFrame(capture, job.run, job.config.tracking, Undistortion.of(capture.rig))
     found = track_surface(read, capture.n_frames, job.config.tracking, job.progress, job.executor)
-    motion = smooth_motion(found.positions, job.fps, found.sigma)
-    filtered = filter_trajectories(found, motion)
-    kept = filtered.trajectories
-    motion = smooth_motion(kept.positions, job.fps, kept.sigma)
+    motion = smooth_motion(found.positions, job.fps, found.sigma, job.config.smoothing)
+    kept = filter_trajectories(found, motion, job.config.filters).trajectories
+    motion = smooth_motion(kept.positions, job.fps, kept.sigma, job.config.smoothing)
     job.run.write_npz(
         "tracks.npz",
         positions=kept.positions,

@@ -28,6 +28,7 @@ _AGREEING = 3
 class FilterSettings(Settings):
     """Which trajectories are cut or removed."""
 
+    on: bool = Field(True, description="Cut and remove trajectories that can't be true")
     fastest: float | None = Field(None, gt=0, description="Highest speed (m/s); from the data if not given")
     acceleration: float | None = Field(
         None, gt=0, description="Highest acceleration (m/s²); from the data if not given"
@@ -77,6 +78,8 @@ def filter_trajectories(tracks: Trajectories, motion: Motion, settings: FilterSe
     settings : FilterSettings, optional
     """
     settings = settings or FilterSettings()
+    if not settings.on:
+        return Filtered(tracks, np.arange(len(tracks)), {}, np.inf, np.inf, np.inf)
     speed = np.linalg.norm(motion.velocities, axis=2)
     change = np.linalg.norm(motion.accelerations, axis=2)
     fastest = settings.fastest or _limit(speed, _MOVING, settings.beyond_data)

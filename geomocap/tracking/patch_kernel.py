@@ -42,7 +42,7 @@ _GAIN = 3.0  # most contrast that an image may lose or win against the template
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _prepare(A, center, shape, template, usable, mask, use_mask, with_slopes, samples, J, T, moments):
+def _prepare(A, center, shape, template, usable, mask, use_mask, with_slopes, stride, samples, J, T, moments):
     """Choose the samples of one camera and form their Jacobian, free of offset and gain.
 
     Returns the number of samples; 0 if too few are seen. `moments`: variance of the template.
@@ -52,7 +52,7 @@ def _prepare(A, center, shape, template, usable, mask, use_mask, with_slopes, sa
     count, offered = 0, 0
     mean_t = 0.0
     mean_j = np.zeros(6)
-    for q in range(M):
+    for q in range(0, M, stride):
         if not usable[q]:
             continue
         offered += 1
@@ -150,6 +150,7 @@ def align_patches(
     use,
     images,
     level,
+    stride,
     masks,
     use_mask,
     P,
@@ -181,6 +182,8 @@ def align_patches(
     images : (C, H, W) float32
     level : int
         Level of the templates.
+    stride : int
+        Use every so many of the samples; 2 is a chequerboard, enough for blurred images.
     masks : (C, H, W) uint8
     use_mask : bool
         Whether samples outside the silhouettes are left out.
@@ -236,6 +239,7 @@ def align_patches(
                 masks[c],
                 use_mask,
                 iterations > 0,
+                stride,
                 samples[c],
                 J[c],
                 T[c],

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.patch_kernel import align_patches
 from geomocap.tracking.patch_templates import take_templates
+
+_COARSE_STRIDE = 2  # of the samples, on blurred levels
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,8 @@ class Alignment:
         Cameras whose correlation is good enough.
     sigma : (N,) float
         Standard deviation of a coordinate, metres: root mean square of the three axes; inf without solution.
+    image_sigma : (N,) float
+        The same without the depth where a single camera sees the patch.
     by_camera : (N, C) float
         Correlation in each camera, −1 where it has no part.
     """
@@ -35,6 +39,7 @@ class Alignment:
     correlation: np.ndarray
     n_views: np.ndarray
     sigma: np.ndarray
+    image_sigma: np.ndarray
     by_camera: np.ndarray
 
     def replaced(self, where: np.ndarray, other: Alignment) -> Alignment:
@@ -44,6 +49,10 @@ class Alignment:
             mine, new = getattr(self, field.name), getattr(other, field.name)
             parts[field.name] = np.where(where.reshape((-1,) + (1,) * (mine.ndim - 1)), new, mine)
         return Alignment(**parts)
+
+    def at(self, positions: np.ndarray, frames: np.ndarray) -> Alignment:
+        """Return it at other places."""
+        return replace(self, positions=positions, frames=frames)
 
 
 @dataclass(frozen=True)
@@ -117,8 +126,7 @@ class Patches:
 
     def moved(self, positions: np.ndarray, frames: np.ndarray) -> Patches:
         """Return them at other places."""
-        parts = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Patches(**(parts | {"positions": positions, "frames": frames}))
+        return replace(self, positions=positions, frames=frames)
 
     @property
     def normals(self) -> np.ndarray:
@@ -157,9 +165,12 @@ def facings(positions: np.ndarray, normals: np.ndarray, view: FrameViews) -> np.
 
 
 def with_templates(patches: Patches, want: np.ndarray, view: FrameViews) -> Patches:
-    """Take templates in the cameras `want` (N, C) bool that have none; where too little is seen there is none."""
-    took = np.ascontiguousarray(want, np.uint8)
-    templates, usable = patches.templates.copy(), patches.usable.copy()
+    """Take templates in the cameras `want` (N, C) bool that have none; where too little is seen there is none.
+
+    The new patches share the large arrays of templates with those given, which have nothing in the places filled.
+    """
+    took = np.ascontiguousarray(want & ~patches.has, np.uint8)
+    templates, usable = patches.templates, patches.usable
     take_templates(
         patches.positions,
         patches.frames,
@@ -239,6 +250,7 @@ def align(
             np.ascontiguousarray(use, np.uint8),
             view.levels[level],
             level,
+            1 if level == len(view.levels) - 1 else _COARSE_STRIDE,
             view.masks,
             level == len(view.levels) - 1,
             view.projections,
@@ -258,4 +270,5 @@ def align(
     best = np.where(counted, correlation, 0).sum(axis=1) / np.maximum(counted.sum(axis=1), 1)
     score = np.where(part.any(axis=1), np.where(counted.any(axis=1), best, mean), -1.0)
     sigma = np.sqrt(covariance[:, :3].mean(axis=1))
-    return Alignment(X, Q, score, counted.sum(axis=1), np.where(np.isfinite(sigma), sigma, np.inf), correlation)
+    sigma = np.where(np.isfinite(sigma), sigma, np.inf)
+    return Alignment(X, Q, score, counted.sum(axis=1), sigma, sigma, correlation)

@@ -6,11 +6,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geomocap.tracking.frame_views import FrameViews
+from geomocap.tracking.one_camera import image_precision
 from geomocap.tracking.patches import Patches, align, facings, with_templates
 from geomocap.tracking.tracking_settings import TrackingSettings
 
 _FIT_VOXELS = 4.5  # radius of the piece of surface that gives a patch its shape, voxels
 _FACING = 0.35
+_FACING_ALONE = 0.5  # of a camera that sees a patch alone
 _HULL_SLACK = 3.0  # voxels that a seed may lie behind the drawn surface
 _REGULAR = 1e-12
 _ROUNDS = 3
@@ -105,12 +107,15 @@ def patch_shape(curvature: np.ndarray, size: np.ndarray, radius_px: int) -> np.n
 
 
 def seed_patches(
-    view: FrameViews, taken: np.ndarray, spacing: float, settings: TrackingSettings, rng: np.random.Generator
+    view: FrameViews,
+    taken: np.ndarray,
+    spacing: float,
+    settings: TrackingSettings,
+    rng: np.random.Generator,
 ) -> Patches:
     """Place new patches where a frame's surface has none.
 
     Places where cameras don't agree are tried again a little beside, twice.
-
     Parameters
     ----------
     view : FrameViews
@@ -137,24 +142,55 @@ def seed_patches(
     return patches
 
 
+def seed_for_one_camera(
+    view: FrameViews, taken: np.ndarray, spacing: float, settings: TrackingSettings, rng: np.random.Generator
+) -> Patches:
+    """Place new patches where a frame's surface has none, each for the camera that sees it best.
+
+    They stay on the surface as it is given. Parameters as for `seed_patches`.
+    """
+    there = view.surface[cKDTree(view.surface).query(taken)[1]]
+    points = view.surface[spread(view.surface, spacing, there, rng)]
+    blank, seen, cosine = _blank(points, view, settings, least_views=1, facing=_FACING_ALONE)
+    patches, reference = _of_best_camera(blank, seen, cosine, view)
+    keep = np.flatnonzero(patches.has.any(axis=1))
+    fits = image_precision(patches, keep, reference[keep], np.ones(len(keep))) < settings.sigma_px * patches.size[keep]
+    return patches.select(keep[fits])
+
+
 def _seed_at(points: np.ndarray, view: FrameViews, settings: TrackingSettings) -> Patches:
     """Make patches at points of the surface (N, 3), as far as two cameras agree on them."""
-    C, L = view.count, len(view.levels)
-    positions, frames, curvature = surface_frames(view, points)
+    blank, seen, cosine = _blank(points, view, settings, least_views=settings.n_views, facing=_FACING)
     # a patch belongs to the camera that faces it best; it needs a second one
-    cosine = facings(positions, frames[:, :, 2], view)
-    seen = _seen(view, positions) & (cosine > _FACING)
-    good = seen.sum(axis=1) >= max(settings.n_views, 2)
-    positions, frames, curvature, cosine, seen = (a[good] for a in (positions, frames, curvature, cosine, seen))
-    reference = np.where(seen, cosine, -1).argmax(axis=1)
-    rows = np.arange(len(positions))
-    size = view.pixel_size(positions)[rows, reference]
-    blank = Patches.without_templates(positions, frames, patch_shape(curvature, size, settings.radius_px), size, C, L)
-    only = np.zeros((len(blank), C), bool)
-    only[rows, reference] = True
-    patches = with_templates(blank, only, view)
+    patches, reference = _of_best_camera(blank, seen, cosine, view)
     keep = np.flatnonzero(patches.has.any(axis=1))
     return _lock(patches.select(keep), seen[keep], reference[keep], view, settings)
+
+
+def _blank(
+    points: np.ndarray, view: FrameViews, settings: TrackingSettings, least_views: int, facing: float
+) -> tuple[Patches, np.ndarray, np.ndarray]:
+    """Patches without templates where enough cameras see the surface, those cameras, and the cosines to them."""
+    positions, frames, curvature = surface_frames(view, points)
+    cosine = facings(positions, frames[:, :, 2], view)
+    seen = _seen(view, positions) & (cosine > facing)
+    good = seen.sum(axis=1) >= least_views
+    positions, frames, curvature, cosine, seen = (a[good] for a in (positions, frames, curvature, cosine, seen))
+    best = np.where(seen, cosine, -1).argmax(axis=1)
+    size = view.pixel_size(positions)[np.arange(len(positions)), best]
+    shape = patch_shape(curvature, size, settings.radius_px)
+    blank = Patches.without_templates(positions, frames, shape, size, view.count, len(view.levels))
+    return blank, seen, cosine
+
+
+def _of_best_camera(
+    blank: Patches, seen: np.ndarray, cosine: np.ndarray, view: FrameViews
+) -> tuple[Patches, np.ndarray]:
+    """Patches with the template of the camera that faces each best, and that camera, (N,) int."""
+    reference = np.where(seen, cosine, -1).argmax(axis=1)
+    only = np.zeros(seen.shape, bool)
+    only[np.arange(len(blank)), reference] = True
+    return with_templates(blank, only, view), reference
 
 
 def _lock(

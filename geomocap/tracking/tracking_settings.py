@@ -19,7 +19,10 @@ class TrackingSettings(Settings):
     search_depth: float = Field(0.06, ge=0, description="How far behind the surface a new patch is looked for (m)")
     correlation: float = Field(0.85, gt=0, lt=1, description="Least mean correlation of a tracked patch")
     camera_correlation: float = Field(0.6, gt=0, lt=1, description="Least correlation for a camera to count")
-    n_views: int = Field(2, ge=1, description="Least number of cameras that see a tracked patch")
+    n_views: int = Field(2, ge=2, description="Least number of cameras that agree on a new patch")
+    one_camera_below: float = Field(
+        0.5, ge=0, le=1, description="Share of the surface on which two cameras agree, below which one alone may do"
+    )
     sigma_px: float = Field(0.2, gt=0, description="Largest standard deviation of a position (pixels on the patch)")
     slack_px: float = Field(8.0, gt=0, description="Depth, beyond two voxels, of what hides a patch (pixels on it)")
     neighbour_px: float = Field(3.0, gt=0, description="Largest distance from where neighbours' motion puts it (px)")

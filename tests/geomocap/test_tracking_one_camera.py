@@ -1,0 +1,61 @@
+"""Patches that a single camera sees."""
+
+import numpy as np
+import pytest
+
+from geomocap.tracking.one_camera import image_precision
+from geomocap.tracking.patch_tracking import track_surface
+from geomocap.tracking.seeding import seed_for_one_camera
+from geomocap.tracking.tracking_settings import TrackingSettings
+from tests.geomocap.moving_ellipsoid import MovingEllipsoid
+
+FRAMES = 6
+SCENE = MovingEllipsoid(n_cameras=3)  # 120° apart: two cameras never see the same surface well
+SETTINGS = TrackingSettings(n_patches=150, radius_px=4, seed_every=4)
+
+
+@pytest.fixture(scope="module")
+def views():
+    return [SCENE.view(k) for k in range(FRAMES)]
+
+
+@pytest.fixture(scope="module")
+def tracks(views):
+    return track_surface(lambda k: views[k], FRAMES, SETTINGS)
+
+
+def test_the_surface_is_covered_where_two_cameras_see_too_little(views, tracks):
+    alone = tracks.n_views == 1
+    assert alone.sum() > 0.8 * tracks.measured.sum()
+    assert tracks.measured.sum(axis=0).min() > 60
+    never = SETTINGS.model_copy(update={"one_camera_below": 0.0})
+    assert len(track_surface(lambda k: views[k], 2, never)) < 15
+
+
+def test_they_follow_the_surface_and_state_how_well(tracks):
+    start = tracks.start
+    error = []
+    for n in range(len(tracks)):
+        turn, place = SCENE.pose(int(start[n]))
+        body = (tracks.positions[n, start[n]] - place) @ turn
+        truth = np.array([SCENE.pose(k)[0] @ body + SCENE.pose(k)[1] for k in range(FRAMES)])
+        error.append(np.linalg.norm(tracks.positions[n] - truth, axis=1))
+    late = (np.arange(FRAMES) > start[:, None]) & (tracks.n_views == 1)
+    error, stated = np.array(error)[late], tracks.sigma[late]
+    # a pixel is 4 mm, a voxel 10 mm, and the ellipsoid shifts by 22 mm and turns by 4° a frame
+    assert np.median(error) < 0.006 and np.percentile(error, 95) < 0.025
+    assert 0.2 < np.median(error) / (1.54 * np.median(stated)) < 2
+
+
+def test_precision_is_that_of_least_squares_in_two_dimensions(views):
+    taken = np.zeros((0, 3))
+    seeds = seed_for_one_camera(views[0], taken, 0.1, SETTINGS, np.random.default_rng(0))
+    camera = seeds.has.argmax(axis=1)
+    assert (seeds.has.sum(axis=1) == 1).all()
+    got = image_precision(seeds, np.arange(len(seeds)), camera, np.full(len(seeds), 0.95))
+    for n in range(len(seeds)):
+        template = seeds.templates[n, camera[n], -1][seeds.usable[n, camera[n]] != 0].astype(float)
+        A = template[:, 1:] - template[:, 1:].mean(axis=0)
+        residual = template[:, 0].var() * (1 - 0.95**2) + 4
+        expected = np.sqrt(np.linalg.eigvalsh(residual * np.linalg.inv(A.T @ A))[-1])
+        assert got[n] == pytest.approx(expected, rel=1e-3)
