@@ -87,7 +87,7 @@ def cloud(
 
 
 @app.command()
-@with_settings("silhouettes", "carving", "tracking")
+@with_settings("silhouettes", "carving", "tracking", "filters", "smoothing")
 def track(
     capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
 ) -> None:
@@ -118,7 +118,7 @@ def segment(
 
 
 @app.command()
-@with_settings("silhouettes", "carving", "cloud", "tracking", *BODIES, "export")
+@with_settings("silhouettes", "carving", "cloud", "tracking", "filters", "smoothing", *BODIES, "export")
 def run(
     capture: CaptureFolder,
     run: RunFolder,
