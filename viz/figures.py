@@ -38,6 +38,8 @@ STYLE: dict[Any, Any] = {
     "lines.solid_capstyle": "round",
 }
 MUTED = "#9aa1aa"
+WIDTH = 9.6
+"""Width of every plot, inches."""
 
 
 def plot(draw: Callable[P, Figure]) -> Callable[P, bytes]:
@@ -55,7 +57,8 @@ def plot(draw: Callable[P, Figure]) -> Callable[P, bytes]:
     return styled
 
 
-def _figure(width: float, height: float) -> Figure:
+def figure_of(width: float, height: float) -> Figure:
+    """Return an empty figure, sizes in inches."""
     return Figure(figsize=(width, height), dpi=140, layout="constrained")
 
 
@@ -79,7 +82,7 @@ def joint_angles(skeleton: Skeleton, fps: float | None) -> Figure:
     count = len(skeleton.joint_names)
     columns = min(4, max(2, count))
     rows = -(-count // columns)
-    figure = _figure(9.6, 1.45 * rows + 0.5)
+    figure = figure_of(WIDTH, 1.45 * rows + 0.5)
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     top = max(float(np.nanmax(size, initial=5.0)), 5.0)
     for j, ax in enumerate(axes.flat):
@@ -101,7 +104,7 @@ def joint_angles(skeleton: Skeleton, fps: float | None) -> Figure:
 def path_curves(paths: Paths, body: np.ndarray, up: str, fps: float | None) -> Figure:
     """Plot the relative paths' coordinates and the distance curves to the seed, as in the M3 paper's figure 4."""
     times, label = _times(len(paths.relative), fps)
-    figure = _figure(9.6, 4.9)
+    figure = figure_of(WIDTH, 4.9)
     axes = figure.subplots(2, 2, sharex=True)
     order = [*(d for d in range(3) if "xyz"[d] != up), "xyz".index(up)]
     colors = [hex_color(body_color(int(b))) for b in body]
@@ -124,7 +127,7 @@ def path_curves(paths: Paths, body: np.ndarray, up: str, fps: float | None) -> F
 @plot
 def integrals(paths: Paths, body: np.ndarray) -> Figure:
     """Plot the integrals of the distance curves: to the seed, sorted, and of all pairs, with the threshold."""
-    figure = _figure(9.6, 2.9)
+    figure = figure_of(WIDTH, 2.9)
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))
     values = 1000 * paths.integrals[paths.seed]
     order = [k for k in np.argsort(values, kind="stable") if k != paths.seed]
@@ -150,7 +153,7 @@ def integrals(paths: Paths, body: np.ndarray) -> Figure:
 @plot
 def counts(numbers: Mapping[str, tuple[Sequence[int], np.ndarray]]) -> Figure:
     """Plot the number of points of each frame: {what: (frames, numbers)}."""
-    figure = _figure(9.6, 2.0)
+    figure = figure_of(WIDTH, 2.0)
     ax = figure.subplots()
     shades = [hex_color(ACCENT), "#c2571a", "#5b8c2a"]
     for (name, (frames, values)), color in zip(numbers.items(), shades, strict=False):
@@ -164,7 +167,7 @@ def counts(numbers: Mapping[str, tuple[Sequence[int], np.ndarray]]) -> Figure:
 @plot
 def coverage(cover: Coverage) -> Figure:
     """Plot the share of each camera's image that the silhouette covers."""
-    figure = _figure(9.6, 2.6)
+    figure = figure_of(WIDTH, 2.6)
     ax = figure.subplots()
     shades = matplotlib.colormaps["viridis"](np.linspace(0, 0.85, len(cover.cameras)))
     for camera, share, cut, color in zip(cover.cameras, cover.share, cover.cut, shades, strict=True):
@@ -180,7 +183,7 @@ def coverage(cover: Coverage) -> Figure:
 @plot
 def ellipsoid_errors(ellipsoids: Ellipsoids) -> Figure:
     """Plot the ellipsoids' point counts and fitting errors over time."""
-    figure = _figure(9.6, 2.3)
+    figure = figure_of(WIDTH, 2.3)
     axes = figure.subplots(1, 2)
     colors = [hex_color(body_color(int(b))) for b in ellipsoids.body]
     for ax, values, title in (
@@ -199,7 +202,7 @@ def ellipsoid_errors(ellipsoids: Ellipsoids) -> Figure:
 @plot
 def bone_lengths(bones: Sequence[Bone], fps: float | None) -> Figure:
     """Plot how far each bone's length is from its mean over time."""
-    figure = _figure(9.6, 2.5)
+    figure = figure_of(WIDTH, 2.5)
     ax = figure.subplots()
     for bone in bones:
         times, label = _times(len(bone.lengths), fps)
@@ -215,7 +218,7 @@ def bone_lengths(bones: Sequence[Bone], fps: float | None) -> Figure:
 def timings(stages: dict[str, dict[str, float]]) -> Figure:
     """Plot the seconds of each stage."""
     names = list(stages)
-    figure = _figure(9.6, 0.3 * len(names) + 0.7)
+    figure = figure_of(WIDTH, 0.3 * len(names) + 0.7)
     ax = figure.subplots()
     seconds = [float(stages[n]["seconds"]) for n in names]
     ax.barh(names, seconds, color=hex_color(ACCENT), height=0.62)

@@ -13,7 +13,7 @@ from geomocap.errors import GeometryError, RunError
 from geomocap.files import write_atomic
 from geomocap.progress import Progress, silent
 from geomocap.run import Run
-from viz import figures, sheets
+from viz import figures, separation, sheets
 from viz.drawing import write_png
 from viz.quality import Quality, assess, relative_paths
 from viz.report import Block, Report, missing, picture, plot, video, write_report
@@ -116,7 +116,7 @@ def review(
         stage = find_stage(results)
     except GeometryError:
         stage = None
-    desk = Desk(run.path / "review", progress, 18)
+    desk = Desk(run.path / "review", progress, 21)
     progress("review", 0, desk.total)
     quality = assess(results, chosen)
     desk.step()
@@ -127,6 +127,7 @@ def review(
         section("Volume and points", _volume(results, stage, chosen, desk)),
         section("Ellipsoids and their paths", _ellipsoids(results, stage, chosen, desk)),
         section("Rigid bodies", _bodies(results, stage, chosen, desk)),
+        section("How the bodies were told apart", _separation(results, stage, desk)),
         section("Skeleton and motion", _skeleton(results, stage, quality, chosen, desk)),
         section("Quality", figures_of_quality(results, quality)),
         section("Time", _times(results, desk)),
@@ -253,6 +254,32 @@ def _bodies(results: Results, stage: Stage | None, frames: list[int], desk: Desk
     return [*blocks, bodies_table(results, middle[0])]
 
 
+def _separation(results: Results, stage: Stage | None, desk: Desk) -> list[Block]:
+    found = results.diagnostics
+    if stage is None or "sample_body" not in found:
+        return []
+    source = {"patches": "patches of the images", "nodes": "nodes of a deformable surface"}
+    followed = source.get(str(found.get("paths", "")), "motion paths")
+    words = (
+        f"The bodies come from {len(found['sample_body'])} {followed}, followed through all frames. Where a subject "
+        "bends in many small steps, like a trunk or a tail, any border is arbitrary: the other numbers of bodies are "
+        "as good. --motion_bodies.bodies sets a number, --motion_bodies.min_turn_deg the criterion."
+    )
+    blocks = desk.sheet("alternatives", separation.alternatives_sheet(results, stage), "Samples by body", words)
+    if "curve_bodies" in found and len(found["curve_bodies"]) > 1:
+        words = (
+            "The weakest body goes, again and again. A steep rise beside the number found is a clear decision; a slow "
+            "one means that a few bodies more or less explain the motion as well."
+        )
+        number = len(np.unique(found["sample_body"][found["sample_body"] >= 0]))
+        curve = separation.elimination_curve(found["curve_bodies"], found["curve_strengths"], number)
+        blocks += desk.plot("elimination", curve, "Number of bodies", words)
+    if "reliability" in found and found["reliability"].shape[1] > 0:
+        words = "Dark: the body was hardly measured there, and its motion is bridged from its neighbours and in time."
+        blocks += desk.plot("reliability", separation.reliability(found["reliability"], results.fps), "Measured", words)
+    return blocks
+
+
 def _skeleton(results: Results, stage: Stage | None, quality: Quality, frames: list[int], desk: Desk) -> list[Block]:
     if stage is None or results.skeleton is None:
         return [missing("The run has no skeleton.")]
@@ -266,6 +293,8 @@ def _skeleton(results: Results, stage: Stage | None, quality: Quality, frames: l
         words = "Bones and joints over the images of all cameras, the volume as glass around them."
         over = sheets.overlay_sheet(results, middle, sheets.skeleton_meshes, 1.0)
         blocks += desk.sheet("skeleton_overlay", over, f"Skeleton over frame {middle[0]}", words)
+    if kinds := separation.joints_table(results):
+        blocks.append(kinds)
     if len(results.skeleton.joint_positions) > 1:
         words = (
             "How far each joint has turned since the first frame, in its body's colour; thin lines: the rotation "
