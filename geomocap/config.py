@@ -8,6 +8,7 @@ from typing import Any
 
 from pydantic import Field
 
+from geomocap.articulation.refinement import RefinementSettings
 from geomocap.carving.settings import CarvingSettings
 from geomocap.cloud.settings import CloudSettings
 from geomocap.errors import SettingsError
@@ -40,6 +41,7 @@ class Config(Settings):
     nodes: NodeTrackingSettings = Field(NodeTrackingSettings(), description="node tracking on the geometry")
     motion_bodies: MotionBodiesSettings = Field(MotionBodiesSettings(), description="bodies from motion paths")
     motion_skeleton: MotionSkeletonSettings = Field(MotionSkeletonSettings(), description="their joints")
+    refinement: RefinementSettings = Field(RefinementSettings(), description="refinement of their motion")
     export: ExportSettings = Field(ExportSettings(), description="motion files")
 
 

@@ -52,7 +52,7 @@ def options(
 
 
 Fps = Annotated[float, typer.Option("--fps", min=0.001, help="Scans per second.")]
-BODIES = ("segmentation", "skeleton", "nodes", "motion_bodies", "motion_skeleton")
+BODIES = ("segmentation", "skeleton", "nodes", "motion_bodies", "motion_skeleton", "refinement")
 Pictures = Annotated[bool, typer.Option(help="Make review pictures and the report.")]
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geomocap.articulation.refinement import refine_skeleton
 from geomocap.geometry import BodyPoints, Geometry
 from geomocap.pipeline.job import Job
 from geomocap.run import Run
@@ -32,6 +33,9 @@ def segment_by_motion(job: Job, geometry: Geometry) -> int:
     job.progress("bodies", 1, 1)
     with job.run.timed("skeleton") as count:
         found = find_motion_skeleton(bodies, job.fps, job.config.motion_skeleton)
+        count["items"] = frames
+    with job.run.timed("refinement") as count:
+        found, bodies = refine_skeleton(found, bodies, paths, job.config.refinement)
         count["items"] = frames
     label = _Label(geometry, job.run, bodies, paths)
     fitted = list(map_items(label, range(frames), job.executor, "labels", job.progress))

@@ -26,7 +26,10 @@ def segment(job: Job, source: Source) -> str:
     if by_motion:
         if job.capture is not None:
             settings["tracks"] = tracks(job)
-        settings |= {name: getattr(config, name).model_dump() for name in ("nodes", "motion_bodies", "motion_skeleton")}
+        settings |= {
+            name: getattr(config, name).model_dump()
+            for name in ("nodes", "motion_bodies", "motion_skeleton", "refinement")
+        }
     else:
         settings["skeleton"] = config.skeleton.model_dump()
     outputs = ["ellipsoids.npz", "bodies", "diagnostics.npz", "skeleton.npz"]

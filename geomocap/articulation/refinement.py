@@ -1,0 +1,254 @@
+"""Refinement: motion, joints and skin of connected bodies, over all frames, against the paths of their samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from geomocap.articulation.adjustment import JointPrior, adjust
+from geomocap.articulation.kinematics import (
+    BodyMotion,
+    JointMotion,
+    Linkage,
+    about_axis,
+    body_motion,
+    joint_motion,
+    posed,
+    since,
+)
+from geomocap.articulation.observations import Observations, SkinPoints
+from geomocap.articulation.skinning import candidates_near, fit_shares
+from geomocap.articulation.smoothness import Smoothness, typical_accelerations
+from geomocap.segmentation.motion_bodies import MotionBodies
+from geomocap.segmentation.motion_paths import MotionPaths
+from geomocap.settings import Settings
+from geomocap.skeleton.motion_skeleton import MotionSkeleton, skeleton_of_motion
+
+_MEDIAN_LENGTH = 1.54  # median length of a normal vector of three dimensions, standard deviations
+_SETTLE_ROUNDS = 3
+
+
+class RefinementSettings(Settings):
+    """How the motion of connected bodies is refined over all frames."""
+
+    rounds: int = Field(
+        default=3, ge=0, description="rounds of skin weights, shape, and motion with joints; 0: no refinement"
+    )
+    steps: int = Field(default=4, ge=1, description="steps of each adjustment of motion and joints")
+    independence: float = Field(
+        default=0.3, gt=0, le=1, description="share of the sightings that err independently of each other (0..1)"
+    )
+    noise: float = Field(
+        default=5e-4, gt=0, description="least standard deviation of how a sample follows its bodies (extents)"
+    )
+    joint_sigma: float = Field(
+        default=8e-4, gt=0, description="standard deviation of the joints found before, against all sightings (extents)"
+    )
+    blend_sigma: float = Field(
+        default=1e-3, gt=0, description="misfit that is worth a change of the skin weights by one (extents)"
+    )
+    hinge_slack_deg: float = Field(
+        default=0.5, ge=0, description="hinges that turn more about other axes (rms) may do so, as balls (degrees)"
+    )
+    least_turn_deg: float = Field(
+        default=0.3, gt=0, description="least scale of the turning accelerations (degrees/frame²)"
+    )
+    least_shift: float = Field(
+        default=5e-4, gt=0, description="least scale of the root's accelerations (extents/frame²)"
+    )
+    cutoff: float = Field(
+        default=3.0, gt=0, description="residuals and accelerations beyond count less (standard deviations)"
+    )
+
+
+@dataclass(frozen=True)
+class RefinedMotion:
+    """A refined motion, counted from frame 0.
+
+    Attributes
+    ----------
+    linkage : Linkage
+        In the pose of frame 0.
+    bodies : BodyMotion
+    points : SkinPoints
+        The samples in the pose of frame 0, with their skin weights.
+    sigma : (N,) float, metres
+        How well each sample follows its bodies: standard deviation of a coordinate.
+    """
+
+    linkage: Linkage
+    bodies: BodyMotion
+    points: SkinPoints
+    sigma: np.ndarray
+
+
+def refine_skeleton(
+    found: MotionSkeleton, bodies: MotionBodies, paths: MotionPaths, settings: RefinementSettings | None = None
+) -> tuple[MotionSkeleton, MotionBodies]:
+    """Refine a skeleton and the bodies that it connects.
+
+    Parameters
+    ----------
+    found : MotionSkeleton
+    bodies : MotionBodies
+        Of the samples of `paths`.
+    paths : MotionPaths
+    settings : RefinementSettings, optional
+
+    Returns
+    -------
+    MotionSkeleton
+    MotionBodies
+        With refined motion, rest and weights; labels stay.
+    """
+    settings = settings or RefinementSettings()
+    if settings.rounds == 0:
+        return found, bodies
+    linkage, motion = linkage_of(found, settings.hinge_slack_deg)
+    points = SkinPoints.of_weights(bodies.rest, bodies.weights)
+    refined = refine_motion(linkage, motion, points, paths, bodies.extent, settings)
+    bodies = replace(
+        bodies,
+        weights=refined.points.weights(bodies.body_count),
+        rotations=refined.bodies.rotations,
+        translations=refined.bodies.translations,
+        rest=refined.points.rest,
+    )
+    middle = np.stack([bodies.rest[bodies.label == b].mean(axis=0) for b in range(bodies.body_count)])
+    skeleton = skeleton_of_motion(
+        linkage.hierarchy,
+        refined.linkage.joints,
+        bodies.rotations,
+        refined.linkage.joint_positions(refined.bodies),
+        bodies.centers,
+        middle,
+        found.skeleton.fps,
+    )
+    joints = tuple(
+        replace(joint, point=point, axis=axis)
+        for joint, point, axis in zip(found.joints, refined.linkage.joints, refined.linkage.axes, strict=True)
+    )
+    return MotionSkeleton(skeleton, joints, found.costs), bodies
+
+
+def linkage_of(found: MotionSkeleton, hinge_slack_deg: float) -> tuple[Linkage, JointMotion]:
+    """Linkage of a skeleton, and its motion.
+
+    Only hinges that turn less than the slack about other axes are hinges to the letter: an elbow is none, and forced to
+    be one it would bend its neighbours' motion.
+    """
+    skeleton = found.skeleton
+    hierarchy = skeleton.hierarchy
+    axes = np.array([joint.axis / np.linalg.norm(joint.axis) for joint in found.joints]).reshape(-1, 3)
+    hinge = np.zeros(len(axes), bool)
+    for j, (_, child) in enumerate(hierarchy.joint_bodies):
+        relative = skeleton.local_rotations[:, child]
+        swing = Rotation.from_matrix(relative @ about_axis(relative, axes[j]).swapaxes(1, 2)).magnitude()
+        hinge[j] = found.joints[j].hinge and np.sqrt((swing**2).mean()) <= np.deg2rad(hinge_slack_deg)
+    linkage = Linkage(hierarchy, skeleton.joint_positions[0], axes, hinge, skeleton.body_positions[0, skeleton.root])
+    return linkage, joint_motion(linkage, skeleton.body_rotations, skeleton.body_positions[:, skeleton.root])
+
+
+def refine_motion(
+    linkage: Linkage,
+    motion: JointMotion,
+    points: SkinPoints,
+    paths: MotionPaths,
+    extent: float,
+    settings: RefinementSettings | None = None,
+) -> RefinedMotion:
+    """Find, by turns, skin weights and shape, and the motion of all frames together with the joints.
+
+    Each sample counts by how well it follows its bodies, so that soft skin has little say. In frames without sightings
+    the temporal prior carries the motion on.
+
+    Parameters
+    ----------
+    linkage, motion
+        Start.
+    points : SkinPoints
+        The samples, at rest.
+    paths : MotionPaths
+        What was seen of them.
+    extent : float, metres
+        Of the subject.
+    settings : RefinementSettings, optional
+    """
+    settings = settings or RefinementSettings()
+    prior = JointPrior(linkage.joints, settings.joint_sigma * extent)
+    least = settings.noise * extent
+    bodies = body_motion(linkage, motion)
+    sigma = _sample_sigma(bodies, points, paths, least)
+    for k in range(settings.rounds):
+        # Shape and skin of the motion so far
+        if k > 0:
+            trust = _trust(bodies, points, paths, settings.cutoff * sigma)
+            pull = np.full(len(points), (settings.blend_sigma * extent) ** 2)
+            near = candidates_near(linkage, points)
+            points = fit_shares(points, bodies, paths.positions, trust, near, pull)
+        points = _settled(points, bodies, paths, settings.cutoff * sigma)
+        sigma = _sample_sigma(bodies, points, paths, least)
+        # Motion and joints of the shape so far
+        spread = np.broadcast_to(sigma[:, None] / np.sqrt(settings.independence), paths.seen.shape)
+        adjusted = adjust(
+            linkage,
+            motion,
+            points,
+            Observations.of_paths(paths.positions, spread),
+            smoothness=smoothness_of(linkage, motion, extent, settings),
+            joint_prior=prior,
+            cutoff=settings.cutoff,
+            rounds=settings.steps,
+        )
+        linkage, motion, bodies = adjusted.linkage, adjusted.motion, adjusted.bodies
+    first = bodies.part(slice(0, 1)).carry(points.rest, points.bodies, points.shares)[0]
+    return RefinedMotion(posed(linkage, bodies, 0), since(bodies, 0), replace(points, rest=first), sigma)
+
+
+def smoothness_of(linkage: Linkage, motion: JointMotion, extent: float, settings: RefinementSettings) -> Smoothness:
+    """Temporal prior whose scales are the accelerations that the motion has, medians over time, above the floors."""
+    turn, shift = typical_accelerations(linkage, motion)
+    return Smoothness(
+        np.maximum(turn, np.deg2rad(settings.least_turn_deg)),
+        max(shift, settings.least_shift * extent),
+        settings.cutoff,
+    )
+
+
+def _misses(bodies: BodyMotion, points: SkinPoints, paths: MotionPaths) -> np.ndarray:
+    """Distances of what was seen from where the bodies carry the points, (N, T), metres; NaN where not seen."""
+    carried = bodies.carry(points.rest, points.bodies, points.shares).swapaxes(0, 1)
+    return np.linalg.norm(carried - paths.positions, axis=2)
+
+
+def _trust(bodies: BodyMotion, points: SkinPoints, paths: MotionPaths, cutoff: np.ndarray) -> np.ndarray:
+    """Weights of the sightings by their misses, (N, T): a half at the cutoff (Cauchy); 0 where not seen."""
+    miss = _misses(bodies, points, paths)
+    return np.where(paths.seen, 1.0 / (1.0 + (np.where(paths.seen, miss, 0.0) / cutoff[:, None]) ** 2), 0.0)
+
+
+def _sample_sigma(bodies: BodyMotion, points: SkinPoints, paths: MotionPaths, least: float) -> np.ndarray:
+    """Standard deviation of a coordinate of each sample, (N,): what is stated, and how well it follows its bodies."""
+    follows = np.nanmedian(_misses(bodies, points, paths), axis=1) / _MEDIAN_LENGTH
+    return np.maximum(np.hypot(paths.typical_sigma(), follows), least)
+
+
+def _settled(points: SkinPoints, bodies: BodyMotion, paths: MotionPaths, cutoff: np.ndarray) -> SkinPoints:
+    """Points with the places at rest that fit the motion best: least squares over the frames, robust."""
+    frames, count = len(bodies.rotations), len(points)
+    matrix, offset = np.zeros((frames, count, 3, 3)), np.zeros((frames, count, 3))
+    for k in range(points.bodies.shape[1]):
+        matrix += points.shares[:, k, None, None] * bodies.rotations[:, points.bodies[:, k]]
+        offset += points.shares[:, k, None] * bodies.translations[:, points.bodies[:, k]]
+    target = np.where(paths.seen[..., None], paths.positions, 0.0).swapaxes(0, 1) - offset
+    rest = points.rest
+    for _ in range(_SETTLE_ROUNDS):
+        trust = _trust(bodies, replace(points, rest=rest), paths, cutoff).T
+        turned = (trust[..., None, None] * matrix).swapaxes(2, 3)
+        normal = (turned @ matrix).sum(axis=0) + 1e-3 * np.eye(3)
+        right = (turned @ target[..., None]).sum(axis=0)[..., 0] + 1e-3 * rest
+        rest = np.linalg.solve(normal, right[..., None])[..., 0]
+    return replace(points, rest=rest)

@@ -1,0 +1,136 @@
+"""Skin weights from motion: which bodies a point follows, and by which shares (linear blend skinning)."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from scipy.spatial import cKDTree
+
+from geomocap.articulation.kinematics import BodyMotion, Linkage
+from geomocap.articulation.observations import INFLUENCES, SkinPoints
+
+_SWEEPS = 60
+
+
+def fit_shares(
+    points: SkinPoints,
+    bodies: BodyMotion,
+    positions: np.ndarray,
+    weights: np.ndarray,
+    candidates: np.ndarray,
+    pull: np.ndarray,
+) -> SkinPoints:
+    """Shares of the bodies that explain the paths of points best, places at rest given.
+
+    Least squares over the frames under w ≥ 0 and Σ w = 1 (Le & Deng, Smooth Skinning Decomposition with Rigid Bones,
+    2012, section 4.2), with a pull towards the shares that a point has.
+
+    Parameters
+    ----------
+    points : SkinPoints
+    bodies : BodyMotion
+    positions : (N, T, 3) float, metres
+    weights : (N, T) float
+        0 where not seen.
+    candidates : (N, 4) int32
+        Bodies that may move a point; -1: none.
+    pull : (N,) float, metres²
+        Weight of the squared difference from the present shares, beside the mean squared distance.
+    """
+    count = bodies.rotations.shape[1]
+    shares = _fit_shares(
+        points.rest,
+        np.ascontiguousarray(bodies.rotations),
+        np.ascontiguousarray(bodies.translations),
+        np.where(np.isfinite(positions), positions, 0.0),
+        weights,
+        candidates,
+        points.weights(count),
+        pull,
+    )
+    return SkinPoints.of_weights(points.rest, shares)
+
+
+def candidates_near(linkage: Linkage, points: SkinPoints) -> np.ndarray:
+    """Bodies that may move each point, (N, 4) int32: its own and those joined to it, the nearest at rest first."""
+    count = linkage.body_count
+    joined = np.eye(count, dtype=bool)
+    parents, children = linkage.hierarchy.joint_bodies.T
+    joined[parents, children] = joined[children, parents] = True
+    distance = np.full((len(points), count), np.inf)
+    for b in range(count):
+        members = points.rest[points.body == b]
+        asked = joined[points.body, b]
+        if len(members) and asked.any():
+            distance[asked, b] = cKDTree(members).query(points.rest[asked])[0]
+    order = np.argsort(distance, axis=1, kind="stable")[:, :INFLUENCES]
+    there = np.isfinite(np.take_along_axis(distance, order, axis=1))
+    result = np.full((len(points), INFLUENCES), -1, np.int32)
+    result[:, : order.shape[1]] = np.where(there, order, -1)
+    return result
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _fit_shares(
+    rest: np.ndarray,
+    rotations: np.ndarray,
+    translations: np.ndarray,
+    positions: np.ndarray,
+    weights: np.ndarray,
+    candidates: np.ndarray,
+    present: np.ndarray,
+    pull: np.ndarray,
+) -> np.ndarray:
+    count, frames = weights.shape
+    result = np.zeros(present.shape)
+    for n in numba.prange(count):
+        bodies = candidates[n][candidates[n] >= 0]
+        k = len(bodies)
+        gram = np.zeros((k, k))
+        away = np.zeros((k, 3))  # seen minus carried: Σ w away is what is left, as Σ w = 1
+        total = 1e-12
+        for t in range(frames):
+            w = weights[n, t]
+            if w == 0.0:
+                continue
+            total += w
+            for a in range(k):
+                for i in range(3):
+                    away[a, i] = positions[n, t, i] - translations[t, bodies[a], i]
+                    for j in range(3):
+                        away[a, i] -= rotations[t, bodies[a], i, j] * rest[n, j]
+                for b in range(a + 1):
+                    product = away[a, 0] * away[b, 0] + away[a, 1] * away[b, 1] + away[a, 2] * away[b, 2]
+                    gram[a, b] += w * product
+        share = np.zeros(k)
+        linear = np.zeros(k)
+        for a in range(k):
+            for b in range(a + 1):
+                gram[a, b] /= total
+                gram[b, a] = gram[a, b]
+            gram[a, a] += pull[n]
+            linear[a] = pull[n] * present[n, bodies[a]]
+            share[a] = present[n, bodies[a]]
+        amount = share.sum()
+        if amount <= 0.0:
+            share[0] = amount = 1.0
+        share /= amount
+        for _ in range(_SWEEPS):  # mass goes from one body to another, as much as is best
+            moved = 0.0
+            for a in range(k):
+                for b in range(a):
+                    slope = linear[a] - linear[b]
+                    for c in range(k):
+                        slope -= (gram[a, c] - gram[b, c]) * share[c]
+                    curve = gram[a, a] + gram[b, b] - 2.0 * gram[a, b]
+                    if curve <= 1e-18:
+                        continue
+                    step = min(max(slope / curve, -share[a]), share[b])
+                    share[a] += step
+                    share[b] -= step
+                    moved = max(moved, abs(step))
+            if moved < 1e-4:
+                break
+        for a in range(k):
+            result[n, bodies[a]] = share[a]
+    return result

@@ -1,0 +1,256 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from geomocap.articulation.adjustment import JointPrior, adjust
+from geomocap.articulation.kinematics import Linkage, body_motion, joint_motion, moved_by, posed, since
+from geomocap.articulation.normal_kernel import normal_equations
+from geomocap.articulation.observations import Observations, SkinPoints
+from geomocap.articulation.refinement import RefinementSettings, refine_motion, refine_skeleton
+from geomocap.articulation.skinning import candidates_near, fit_shares
+from geomocap.articulation.smoothness import Smoothness, accelerations
+from geomocap.segmentation.motion_bodies import MotionBodiesSettings, find_motion_bodies
+from geomocap.segmentation.motion_paths import MotionPaths
+from geomocap.segmentation.rigid_motions import turn_angles
+from geomocap.skeleton.hierarchy import Hierarchy
+from geomocap.skeleton.motion_skeleton import find_motion_skeleton
+from tests.geomocap.moving_chains import Chain, chain
+
+
+def linked(scene: Chain, hinges: bool = False):
+    """Linkage, true motion and skin of a chain."""
+    count = len(scene.joints) + 1
+    hierarchy = Hierarchy(0, np.array([[b, b + 1] for b in range(count - 1)], np.int32))
+    origin = scene.positions[scene.body == 0, 0].mean(axis=0)
+    linkage = Linkage(hierarchy, scene.joints, scene.axes, np.full(count - 1, hinges), origin)
+    root = scene.rotations[:, 0] @ origin + scene.translations[:, 0]
+    points = SkinPoints.of_weights(scene.positions[:, 0], np.eye(count)[scene.body])
+    return linkage, joint_motion(linkage, scene.rotations, root), points
+
+
+def prior(linkage, turn=0.05, shift=0.02):
+    return Smoothness(np.full(linkage.body_count, turn), shift, 3.0)
+
+
+def disturbed(linkage, motion, size, seed=0):
+    step = np.random.default_rng(seed).normal(0, size, (motion.frames, linkage.joint_dof[-1]))
+    return moved_by(linkage, motion, step)
+
+
+def turn_errors_deg(found, true):
+    return np.rad2deg(turn_angles(np.swapaxes(found, -1, -2) @ true))
+
+
+@pytest.mark.parametrize("hinges", [False, True])
+def test_forward_kinematics_are_those_of_the_chain(hinges):
+    scene = chain(4)
+    linkage, motion, points = linked(scene, hinges)
+    bodies = body_motion(linkage, motion)
+    np.testing.assert_allclose(bodies.rotations, scene.rotations, atol=1e-12)
+    np.testing.assert_allclose(bodies.translations, scene.translations, atol=1e-12)
+    carried = bodies.carry(points.rest, points.bodies, points.shares)
+    np.testing.assert_allclose(carried.swapaxes(0, 1), scene.positions, atol=1e-12)
+
+
+def test_another_frame_can_be_the_rest_pose():
+    linkage, motion, _ = linked(chain(3))
+    bodies = body_motion(linkage, motion)
+    places = linkage.joint_positions(bodies)
+    moved, again = posed(linkage, bodies, 5), since(bodies, 5)
+    np.testing.assert_allclose(again.rotations[5], np.tile(np.eye(3), (3, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(moved.joint_positions(again), places, atol=1e-12)
+
+
+def test_kernel_agrees_with_the_sums_written_out():
+    rng = np.random.default_rng(1)
+    frames, bodies, unknowns, count, seen, cutoff = 2, 3, 7, 6, 11, 2.0
+    rotations = Rotation.random(frames * bodies, rng=1).as_matrix().reshape(frames, bodies, 3, 3)
+    translations = rng.normal(size=(frames, bodies, 3))
+    twists = rng.normal(size=(frames, unknowns, 6))
+    chains = [[0, 1], [0, 1, 2, 3], [0, 1, 4, 5, 6]]
+    start = np.array([0, 5, seen])
+    skin = SkinPoints.of_weights(rng.normal(size=(count, 3)), rng.dirichlet(np.ones(bodies), count))
+    point = rng.integers(0, count, seen).astype(np.int32)
+    target = rng.normal(size=(seen, 3))
+    normal = rng.normal(size=(seen, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    isotropic, across = rng.random((2, seen))
+    matrix, right, cost = normal_equations(
+        rotations,
+        translations,
+        twists,
+        np.concatenate(chains),
+        np.concatenate([[0], np.cumsum([len(c) for c in chains])]),
+        skin.rest,
+        skin.bodies,
+        skin.shares,
+        start,
+        point,
+        target,
+        normal,
+        isotropic,
+        across,
+        cutoff,
+    )
+    for t in range(frames):
+        expected, side, total = np.zeros((unknowns, unknowns)), np.zeros(unknowns), 0.0
+        for m in range(start[t], start[t + 1]):
+            place, jacobian = np.zeros(3), np.zeros((3, unknowns))
+            for b, share in zip(skin.bodies[point[m]], skin.shares[point[m]], strict=True):
+                x = rotations[t, b] @ skin.rest[point[m]] + translations[t, b]
+                place += share * x
+                for u in chains[b]:
+                    jacobian[:, u] += share * (np.cross(twists[t, u, :3], x) + twists[t, u, 3:])
+            miss = target[m] - place
+            weight = isotropic[m] * np.eye(3) + across[m] * np.outer(normal[m], normal[m])
+            chi2 = miss @ weight @ miss
+            total += 0.5 * cutoff**2 * np.log1p(chi2 / cutoff**2)
+            weight /= 1.0 + chi2 / cutoff**2
+            expected += jacobian.T @ weight @ jacobian
+            side += jacobian.T @ weight @ miss
+        np.testing.assert_allclose(matrix[t], expected, atol=1e-10)
+        np.testing.assert_allclose(right[t], side, atol=1e-10)
+        np.testing.assert_allclose(cost[t], total, rtol=1e-12)
+
+
+def test_poses_and_joints_are_recovered():
+    scene = chain(4)
+    linkage, motion, points = linked(scene)
+    shifted = replace(linkage, joints=linkage.joints + np.random.default_rng(2).normal(0, 0.02, (3, 3)))
+    sightings = Observations.of_paths(scene.positions, np.full(scene.positions.shape[:2], 0.002))
+    found = adjust(
+        shifted,
+        disturbed(linkage, motion, 0.1),
+        points,
+        sightings,
+        smoothness=prior(linkage, 1.0, 1.0),
+        joint_prior=JointPrior(shifted.joints, 1.0),
+        rounds=30,
+    )
+    assert turn_errors_deg(found.bodies.rotations, scene.rotations).max() < 0.05
+    along = np.abs(np.einsum("ji,ji->j", found.linkage.joints - scene.joints, scene.axes))
+    across = np.linalg.norm(found.linkage.joints - scene.joints, axis=1) ** 2 - along**2
+    assert np.sqrt(np.maximum(across, 0)).max() < 2e-4  # along a hinge every point is common
+
+
+def test_frames_without_sightings_are_bridged():
+    scene = chain(3, frames=60, turn_deg=30.0)
+    linkage, motion, points = linked(scene)
+    seen = scene.positions.copy()
+    seen[:, 20:26] = np.nan
+    start = joint_motion(linkage, scene.rotations.copy(), motion.root.copy())
+    start.local[20:26], start.root[20:26] = start.local[19], start.root[19]
+    sightings = Observations.of_paths(seen, np.full(seen.shape[:2], 0.002))
+    found = adjust(linkage, start, points, sightings, smoothness=prior(linkage, 0.02, 0.005), rounds=30)
+    held = turn_errors_deg(body_motion(linkage, start).rotations, scene.rotations)[20:26].max()
+    assert held > 10.0
+    assert turn_errors_deg(found.bodies.rotations, scene.rotations)[20:26].max() < 1.0
+
+
+def test_noise_goes_and_a_kick_stays_without_lag():
+    scene = chain(2, frames=41)
+    linkage, motion, points = linked(scene)
+    angle = np.deg2rad(60.0) * (np.arange(41) >= 20)  # from one frame to the next
+    local = motion.local.copy()
+    local[:, 1] = Rotation.from_rotvec(angle[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    true = replace(motion, local=local)
+    positions = body_motion(linkage, true).carry(points.rest, points.bodies, points.shares).swapaxes(0, 1)
+    noisy = disturbed(linkage, true, np.deg2rad(0.5), seed=3)
+    shaken = body_motion(linkage, noisy).carry(points.rest, points.bodies, points.shares).swapaxes(0, 1)
+    sightings = Observations.of_paths(shaken, np.full(positions.shape[:2], 0.05))
+    found = adjust(linkage, noisy, points, sightings, smoothness=prior(linkage, 0.005, 0.001), rounds=30)
+    turned = Rotation.from_matrix(found.motion.local[:, 1]).as_rotvec()[:, 2]
+    shaking = np.abs(accelerations(linkage, noisy)[:18]).mean()
+    assert np.abs(accelerations(linkage, found.motion)[:18]).mean() < 0.5 * shaking
+    assert turned[19] < np.deg2rad(3.0) and turned[20] > np.deg2rad(57.0)
+
+
+def test_hinge_turns_about_its_axis_only():
+    scene = chain(3)
+    linkage, motion, points = linked(scene, hinges=True)
+    shaken = scene.positions + np.random.default_rng(4).normal(0, 0.01, scene.positions.shape)
+    sightings = Observations.of_paths(shaken, np.full(shaken.shape[:2], 0.01))
+    found = adjust(linkage, motion, points, sightings, rounds=20)
+    for j in range(2):
+        vectors = Rotation.from_matrix(found.motion.local[:, j + 1]).as_rotvec()
+        np.testing.assert_allclose(np.cross(vectors, linkage.axes[j]), 0.0, atol=1e-9)
+    assert turn_errors_deg(found.bodies.rotations, scene.rotations).max() < 2.0
+
+
+def test_shares_of_soft_skin_are_found():
+    scene = chain(3, samples=40)
+    linkage, motion, points = linked(scene)
+    bodies = body_motion(linkage, motion)
+    rng = np.random.default_rng(5)
+    weights = np.zeros((len(points), 3))
+    weights[:, :2] = rng.dirichlet([1.0, 1.0], len(points))
+    true = SkinPoints.of_weights(points.rest, weights)
+    seen = bodies.carry(true.rest, true.bodies, true.shares).swapaxes(0, 1)
+    near = np.tile(np.array([0, 1, 2, -1], np.int32), (len(points), 1))
+    found = fit_shares(points, bodies, seen, np.ones(seen.shape[:2]), near, np.full(len(points), 1e-12))
+    np.testing.assert_allclose(found.weights(3), true.weights(3), atol=0.011)  # shares below 0.01 are dropped
+
+
+def test_shares_are_the_least_squares_ones():
+    scene = chain(3, samples=30)
+    linkage, motion, points = linked(scene)
+    bodies = body_motion(linkage, motion)
+    rng = np.random.default_rng(6)
+    seen = scene.positions + rng.normal(0, 0.1, scene.positions.shape)
+    weights = rng.random(seen.shape[:2])
+    near = candidates_near(linkage, points)
+    pull = np.full(len(points), 1e-3)
+    found = fit_shares(points, bodies, seen, weights, near, pull).weights(3)
+    for n in (0, 40, 80):
+        carried = np.einsum("tbij,j->tbi", bodies.rotations, points.rest[n]) + bodies.translations
+        present = points.weights(3)[n]
+
+        def cost(w, n=n, carried=carried, present=present):
+            square = ((seen[n] - np.einsum("b,tbi->ti", w, carried)) ** 2).sum(axis=1)
+            return (weights[n] * square).sum() / weights[n].sum() + pull[n] * ((w - present) ** 2).sum()
+
+        allowed = [(0.0, 1.0) if b in near[n] else (0.0, 0.0) for b in range(3)]
+        one = {"type": "eq", "fun": lambda w: w.sum() - 1.0}
+        best = minimize(cost, present, bounds=allowed, constraints=one, options={"ftol": 1e-12})
+        assert cost(found[n]) <= best.fun * 1.001 + 1e-9
+
+
+def test_refined_skeleton_is_nearer_to_the_truth_and_keeps_its_bones():
+    scene = chain(3, frames=40)
+    rng = np.random.default_rng(7)
+    positions = scene.positions + rng.normal(0, 0.004, scene.positions.shape)
+    paths = MotionPaths(positions)
+    bodies = find_motion_bodies(paths, MotionBodiesSettings(bodies=3))
+    found = find_motion_skeleton(bodies, 30.0)
+    skeleton, refined = refine_skeleton(found, bodies, paths)
+
+    def errors(some):
+        true = [np.bincount(scene.body[bodies.label == b]).argmax() for b in range(some.body_count)]
+        return turn_errors_deg(some.rotations, scene.rotations[:, true]).mean()
+
+    assert errors(refined) < errors(bodies)
+    bone = np.linalg.norm(np.diff(skeleton.skeleton.joint_positions, axis=1), axis=2)  # both joints are the middle's
+    np.testing.assert_allclose(bone, np.full_like(bone, bone[0, 0]), rtol=1e-9)
+    np.testing.assert_allclose(refined.rotations[0], np.tile(np.eye(3), (3, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(refined.weights.sum(axis=1), 1.0)
+
+
+def test_perfect_paths_are_not_made_worse_and_results_repeat():
+    scene = chain(3)
+    linkage, motion, points = linked(scene)
+    paths = MotionPaths(scene.positions)
+    found = refine_motion(linkage, motion, points, paths, 1.3)
+    assert turn_errors_deg(found.bodies.rotations, scene.rotations).max() < 0.05
+    again = refine_motion(linkage, motion, points, paths, 1.3)
+    np.testing.assert_array_equal(found.bodies.rotations, again.bodies.rotations)
+    np.testing.assert_array_equal(found.points.shares, again.points.shares)
+
+
+def test_no_rounds_mean_no_change():
+    paths = MotionPaths(chain(2).positions)
+    bodies = find_motion_bodies(paths)
+    found = find_motion_skeleton(bodies, 30.0)
+    assert refine_skeleton(found, bodies, paths, RefinementSettings(rounds=0)) == (found, bodies)
