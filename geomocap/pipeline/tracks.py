@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 from geomocap.capture import Capture, read_image
 from geomocap.carving.views import Undistortion
@@ -14,6 +15,7 @@ from geomocap.run import Run, stage_key
 from geomocap.tracking.filters import filter_trajectories
 from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.patch_tracking import track_surface
+from geomocap.tracking.seeding import image_reduction
 from geomocap.tracking.smoothing import smooth_motion
 from geomocap.tracking.tracking_settings import TrackingSettings
 from geomocap.tracking.trajectories import REASONS
@@ -31,7 +33,7 @@ def tracks(job: Job) -> str:
 
 
 def _track(job: Job, capture: Capture) -> int:
-    read = _ReadFrame(capture, job.run, job.config.tracking, Undistortion.of(capture.rig))
+    read = frame_reader(capture, job.run, job.config.tracking)
     found = track_surface(read, capture.n_frames, job.config.tracking, job.progress, job.executor)
     motion = smooth_motion(found.positions, job.fps, found.sigma, job.config.smoothing)
     kept = filter_trajectories(found, motion, job.config.filters).trajectories
@@ -57,6 +59,12 @@ def _track(job: Job, capture: Capture) -> int:
     return capture.n_frames
 
 
+def frame_reader(capture: Capture, run: Run, settings: TrackingSettings) -> Callable[[int], FrameViews]:
+    """Return what reads the frames of a run for tracking; the first one tells how far images may be reduced."""
+    read = _ReadFrame(capture, run, settings, Undistortion.of(capture.rig), settings.reduction or 1)
+    return read if settings.reduction else replace(read, reduction=image_reduction(read(0), settings))
+
+
 @dataclass(frozen=True)
 class _ReadFrame:
     """Images, silhouettes and voxels of a frame as tracking wants them."""
@@ -65,10 +73,11 @@ class _ReadFrame:
     run: Run
     settings: TrackingSettings
     undistortion: Undistortion
+    reduction: int
 
     def __call__(self, frame: int) -> FrameViews:
         cameras = self.capture.cameras
         images = self.undistortion.images([self.capture.frame(c, frame) for c in cameras])
         masks = [read_image(self.run.silhouette_file(c, frame), gray=True) for c in cameras]
         voxels = Voxels.read(self.run.frame_file("voxels", frame))
-        return FrameViews.of(self.undistortion.views(masks), images, voxels, self.settings.blurs_px)
+        return FrameViews.of(self.undistortion.views(masks), images, voxels, self.settings.blurs_px, self.reduction)

@@ -53,7 +53,12 @@ class FrameViews:
 
     @classmethod
     def of(
-        cls, views: PinholeViews, images: np.ndarray, voxels: Voxels, blurs_px: Sequence[float] = (2.5, 0.8)
+        cls,
+        views: PinholeViews,
+        images: np.ndarray,
+        voxels: Voxels,
+        blurs_px: Sequence[float] = (2.5, 0.8),
+        reduction: int = 1,
     ) -> FrameViews:
         """Prepare a frame.
 
@@ -66,7 +71,9 @@ class FrameViews:
         voxels : Voxels
             Surface of the subject.
         blurs_px : sequence of float
-            Standard deviations of the Gaussian blurs, coarsest first, pixels.
+            Standard deviations of the Gaussian blurs, coarsest first, pixels (reduced ones).
+        reduction : int
+            So many pixels in each direction are averaged before all else.
 
         Raises
         ------
@@ -78,6 +85,9 @@ class FrameViews:
             raise GeometryError(f"images have shape {images.shape}, their silhouettes {views.masks.shape}")
         if not len(voxels.indices):
             raise GeometryError("a frame without surface voxels can't be tracked; carve it again")
+        if reduction > 1:
+            views, images = _reduced(views, images, reduction)
+            C, H, W = views.masks.shape
         P = views.projections / np.linalg.norm(views.projections[:, 2:, :3], axis=2, keepdims=True)
         P = P * np.sign(np.linalg.det(P[:, :, :3]))[:, None, None]
         P[:, :2] -= 0.5 * P[:, 2:]
@@ -143,6 +153,27 @@ class FrameViews:
         row = np.rint(np.where(inside, pixel[:, :, 1], -1)).clip(-1, H).astype(np.int64)
         inside &= (column >= 0) & (row >= 0) & (column < W) & (row < H)
         return inside, row.clip(0, H - 1), column.clip(0, W - 1)
+
+
+def _reduced(views: PinholeViews, images: np.ndarray, factor: int) -> tuple[PinholeViews, np.ndarray]:
+    """Average `factor` × `factor` pixels of the subject; what is left over on the right and below is cut off."""
+    C, H, W = views.masks.shape
+    height, width = H // factor, W // factor
+    size, part = (width, height), (slice(height * factor), slice(width * factor))
+    masks, valid = np.zeros((C, height, width), np.uint8), np.zeros((C, height, width), np.uint8)
+    small = np.zeros((C, height, width, 3), np.uint8)
+    for c in range(C):
+        share = cv2.resize(views.masks[c][part].astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        inside = images[c][part] * views.masks[c][part][:, :, None]
+        value = cv2.resize(inside.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        small[c] = np.rint(value / np.maximum(share, 1 / factor**2)[:, :, None]).clip(0, 255)
+        masks[c] = share >= 0.5
+        valid[c] = cv2.erode(views.valid[c][part], np.ones((factor, factor), np.uint8), anchor=(0, 0))[
+            ::factor, ::factor
+        ]
+    P = views.projections.copy()
+    P[:, :2] /= factor
+    return PinholeViews(views.names, P, masks & valid, valid), small
 
 
 def _blur(image: np.ndarray, mask: np.ndarray, blurs_px: Sequence[float], out: np.ndarray) -> None:

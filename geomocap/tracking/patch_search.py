@@ -19,6 +19,8 @@ _NEW_TEMPLATE_CORRELATION = 0.9
 _SURE = 0.9  # correlation from which no second start is tried
 _SURE_START = 0.95  # correlation of the blurred images from which optical flow isn't needed
 _NEIGHBOURS = 8
+_ALONE = 2.0  # times the standard deviation that is allowed where a single camera sees a patch
+_ROUGH = 2 / 3
 _AGREEING = 3  # neighbours whose motion a patch must share
 _SLACK_VOXELS = 2.0
 _ITERATIONS = (6, 10)  # on the coarse and the fine level
@@ -140,7 +142,8 @@ def judge(state: Followed, found: Alignment, view: FrameViews, settings: Trackin
     """Return why each patch can't be taken as measured, (N,) int; `LAST_FRAME` (0) where it can."""
     size = state.patches.size
     reason = np.full(len(size), LAST_FRAME)
-    reason[found.image_sigma > settings.sigma_px * size] = LOW_PRECISION
+    alone = found.n_views == 1
+    reason[found.image_sigma > settings.sigma_px * np.where(alone, _ALONE, 1.0) * size] = LOW_PRECISION
     reason[found.correlation < settings.correlation] = LOW_CORRELATION
     reason[found.n_views < _enough(state, found, settings)] = UNSEEN
     reason[(reason == LAST_FRAME) & ~view.may_be_subject(found.positions)] = OUTSIDE
@@ -149,7 +152,12 @@ def judge(state: Followed, found: Alignment, view: FrameViews, settings: Trackin
     if near.shape[1] >= _AGREEING:
         old = state.patches
         places, _ = carried(old.positions, old.frames, near, found.positions, found.frames, good)
-        away = np.linalg.norm(places - found.positions[good][:, None], axis=2)
+        away = places - found.positions[good][:, None]
+        # where a single camera sees a patch its depth is rough: that counts a third
+        ray = view.centers[found.by_camera[good].argmax(axis=1)] - found.positions[good]
+        ray *= (alone[good] / np.linalg.norm(ray, axis=1))[:, None]
+        away -= _ROUGH * np.einsum("nki,ni->nk", away, ray)[:, :, None] * ray[:, None]
+        away = np.linalg.norm(away, axis=2)
         apart = np.sort(away, axis=1)[:, _AGREEING - 1] > settings.neighbour_px * size[good]
         reason[good[apart]] = APART
     return reason

@@ -17,6 +17,7 @@ _HULL_SLACK = 3.0  # voxels that a seed may lie behind the drawn surface
 _REGULAR = 1e-12
 _ROUNDS = 3
 _PACKING = 0.7  # points placed at random at least r apart, as many as fit: 0.7 a square of r
+_COVER = 0.7  # half the width of a patch, as a share of the spacing
 _PEAK_PX = 3.0  # half the width of a peak of correlation along the ray, pixels
 _CLEAR = 0.05  # correlation by which it must exceed all others
 _SWEEP_PX = 1.0  # step of the search along the viewing ray, pixels
@@ -26,6 +27,17 @@ def seed_spacing(view: FrameViews, n_patches: int) -> float:
     """Return the distance of seeds, metres, at which about `n_patches` cover the surface of a frame."""
     area = 0.75 * len(view.surface) * view.voxel_size**2  # a slanted surface has more voxels than squares
     return float(np.sqrt(_PACKING * area / n_patches))
+
+
+def image_reduction(view: FrameViews, settings: TrackingSettings) -> int:
+    """Return by how much images may be reduced: to pixels with which patches of `radius_px` just cover the surface.
+
+    Finer images have more noise and less texture in a patch, and take longer.
+    """
+    if not len(view.surface):
+        return 1
+    pixel = float(np.median(view.pixel_size(view.surface)))
+    return max(1, round(_COVER * seed_spacing(view, settings.n_patches) / (settings.radius_px * pixel)))
 
 
 def spread(points: np.ndarray, spacing: float, taken: np.ndarray, rng: np.random.Generator) -> np.ndarray:

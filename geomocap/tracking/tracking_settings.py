@@ -12,6 +12,9 @@ class TrackingSettings(Settings):
 
     n_patches: int = Field(2000, ge=10, le=100_000, description="Patches placed on a frame's whole surface")
     radius_px: int = Field(5, ge=2, le=20, description="Half the width of a patch (pixels)")
+    reduction: int | None = Field(
+        None, ge=1, le=16, description="Reduction of the images; so that patches just cover the surface if not given"
+    )
     blurs_px: tuple[float, float] = Field((2.5, 0.8), description="Blur of the coarse and the fine level (pixels)")
     seed_every: int = Field(10, ge=1, description="Frames between two looks for surface without patches")
     seed_correlation: float = Field(0.85, gt=0, lt=1, description="Least correlation between cameras for a new patch")

@@ -43,7 +43,7 @@ def test_they_follow_the_surface_and_state_how_well(tracks):
     late = (np.arange(FRAMES) > start[:, None]) & (tracks.n_views == 1)
     error, stated = np.array(error)[late], tracks.sigma[late]
     # a pixel is 4 mm, a voxel 10 mm, and the ellipsoid shifts by 22 mm and turns by 4° a frame
-    assert np.median(error) < 0.006 and np.percentile(error, 95) < 0.025
+    assert np.median(error) < 0.006 and np.percentile(error, 95) < 0.03
     assert 0.2 < np.median(error) / (1.54 * np.median(stated)) < 2
 
 

@@ -11,7 +11,7 @@ from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.patch_kernel import align_patches
 from geomocap.tracking.patch_tracking import track_surface
 from geomocap.tracking.patches import Patches, align, with_templates
-from geomocap.tracking.seeding import patch_shape, seed_patches, seed_spacing, spread, surface_frames
+from geomocap.tracking.seeding import image_reduction, patch_shape, seed_patches, seed_spacing, spread, surface_frames
 from geomocap.tracking.tracking_settings import TrackingSettings
 from geomocap.tracking.trajectories import REASONS
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
@@ -62,6 +62,30 @@ def test_frame_views_refuse_images_of_another_size(scene):
     nothing = Voxels(np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8), np.zeros(3), 0.01)
     with pytest.raises(GeometryError, match="without surface"):
         FrameViews.of(views, images, nothing)
+
+
+def test_reduced_frames_show_the_same_scene_in_larger_pixels(scene):
+    fine = MovingEllipsoid(width=321, height=243, focal=520.0)
+    images, masks = fine.images(0)
+    views = PinholeViews.of(fine.projections(), masks)
+    full = FrameViews.of(views, images, fine.voxels(0))
+    half = FrameViews.of(views, images, fine.voxels(0), reduction=2)
+    assert half.levels.shape == (2, 6, 121, 160)
+    points = np.array([[0.1, 0.05, 0.1], [-0.1, 0, 0]])
+    # COLMAP pixels halve; array indices are half a pixel less
+    assert_allclose(half.project(points)[0] + 0.5, (full.project(points)[0] + 0.5) / 2)
+    assert_allclose(half.project(points)[1], full.project(points)[1])
+    mean = full.levels[1, 0, :242, :320].reshape(121, 2, 160, 2).mean(axis=(1, 3))
+    inside = np.stack([binary_erosion(half.masks[0], iterations=4)])[0]
+    assert np.corrcoef(mean[inside], half.levels[1, 0][inside])[0, 1] > 0.98
+    assert abs(half.masks.sum() * 4 / full.masks.sum() - 1) < 0.01
+
+
+def test_images_are_reduced_until_patches_just_cover_the_surface(views):
+    few = TrackingSettings(n_patches=100, radius_px=2)
+    spacing, pixel = seed_spacing(views[0], 100), np.median(views[0].pixel_size(views[0].surface))
+    assert image_reduction(views[0], few) == round(0.7 * spacing / (2 * pixel)) == 4
+    assert image_reduction(views[0], few.model_copy(update={"n_patches": 20_000})) == 1
 
 
 def test_pixel_size_is_depth_by_focal_length(views):
