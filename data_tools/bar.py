@@ -21,6 +21,7 @@ from geomocap.scheduling import map_items
 TARGET_SAMPLES = 16  # rays a pixel are this squared
 ROOM_LIGHT = 0.06  # of the room's usual light
 TARGET_LEVEL, ROD_LEVEL = 225.0, 14.0  # grey levels
+LENS_BLUR = 0.7  # pixels, standard deviation: no lens draws targets as sharp as the pixels' squares alone
 
 
 @dataclass(frozen=True)
@@ -156,4 +157,4 @@ def picture_bar(
         hit = (toward @ toward - along**2 <= radius**2) & (along > 0)
         coverage = hit.mean(axis=1)[:, None].astype(np.float32)
         flat[near] += coverage * (TARGET_LEVEL - flat[near])
-    return image
+    return cv2.GaussianBlur(image, (0, 0), LENS_BLUR)
