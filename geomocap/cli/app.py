@@ -18,7 +18,7 @@ from geomocap.cli.info import info
 from geomocap.cli.jobs import CaptureFolder, RunFolder, capture_job, scans_job
 from geomocap.cli.keypoints import keypoints
 from geomocap.cli.progress import progress_bars
-from geomocap.cli.reports import capture_of, console, review_job, tell_results
+from geomocap.cli.reports import capture_of, console, review_job, tell_clouds, tell_results
 from geomocap.cli.settings_options import with_settings
 from geomocap.config import Config
 from geomocap.run import Run
@@ -84,6 +84,7 @@ def cloud(
     """Measure the surface by least squares matching: a dense point cloud for each frame."""
     with capture_job(capture, run, config, workers, scheduler) as job:
         pipeline.clouds(job)
+    tell_clouds(job.run)
 
 
 @app.command()
@@ -138,6 +139,8 @@ def run(
         key = pipeline.motion_files(job, source)
         if pictures:
             review_job(job, key)
+    if source == "cloud":
+        tell_clouds(job.run)
     tell_results(run)
 
 

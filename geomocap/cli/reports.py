@@ -9,6 +9,7 @@ from rich.console import Console
 from geomocap.capture import Capture
 from geomocap.errors import GeomocapError
 from geomocap.files import fingerprint
+from geomocap.pipeline.clouds import read_cloud_record
 from geomocap.pipeline.job import Job
 from geomocap.run import Run, stage_key
 from viz.review import review
@@ -46,3 +47,15 @@ def tell_results(run: Path) -> None:
     for what, file in (("motion", "motion.bvh"), ("report", "review/report.html")):
         if (run / file).exists():
             console.print(f"{what}: {run / file}")
+
+
+def tell_clouds(run: Run) -> None:
+    """Print how many points were measured, why others were not, and what looks wrong with the cameras."""
+    record = read_cloud_record(run)
+    if record is None:
+        return
+    console.print(f"cloud: {record.points / record.frames:,.0f} points per frame")
+    for reason, number in sorted(record.reasons.items(), key=lambda r: -r[1]):
+        console.print(f"  {number / record.frames:>9,.0f} {reason}")
+    for warning, frames in record.warnings.items():
+        console.print(f"warning: {warning}" + (f" (in {frames} frames)" if record.frames > 1 else ""))

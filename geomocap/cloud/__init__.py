@@ -1,7 +1,8 @@
 """Surface measurement: the images of one frame become a point cloud."""
 
-from geomocap.cloud.frame import CloudFrame, TemplateCloud, cloud_of_frame, undistorted_color
+from geomocap.cloud.frame import CloudFrame, TemplateCloud, cloud_of_frame
 from geomocap.cloud.groups import MatchGroup, MatchGroups, match_groups
+from geomocap.cloud.images import undistorted_color
 from geomocap.cloud.points import MeasuredPoints
 from geomocap.cloud.settings import CloudSettings
 

@@ -11,9 +11,19 @@ from geomocap.cameras import Rig
 from geomocap.geometry import Voxels
 from geomocap.matching.seeds import DepthRange
 
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Corners (min, max) of a region of interest, metres, world."""
+
 
 def depth_range(
-    rig: Rig, camera: int, shape: tuple[int, int], near: float, far: float, hull: Voxels | None, behind: float
+    rig: Rig,
+    camera: int,
+    shape: tuple[int, int],
+    near: float,
+    far: float,
+    hull: Voxels | None,
+    behind: float,
+    box: Box | None = None,
 ) -> DepthRange:
     """Bounds of the depth for every pixel of a camera.
 
@@ -26,15 +36,40 @@ def depth_range(
     near, far : float
         Bounds where there is no hull, metres.
     hull : Voxels, optional
-        Then surface is sought from just before the hull to `behind` metres behind its front.
+        Then surface is sought from just before the hull to some way behind its front.
     behind : float
-        Metres.
+        That way, in diagonals of the hull.
+    box : Box, optional
+        Then surface is sought inside it.
     """
-    if hull is None:
-        return DepthRange.constant(shape, near, far)
-    front = hull_depth(rig, camera, shape, hull)
-    front[~np.isfinite(front)] = np.nan
-    return DepthRange(front - np.float32(2 * hull.voxel_size), front + np.float32(behind))
+    bounds = DepthRange.constant(shape, near, far)
+    if hull is not None:
+        front = hull_depth(rig, camera, shape, hull)
+        front[~np.isfinite(front)] = np.nan
+        diagonal = float(np.linalg.norm(np.ptp(hull.points, axis=0)))
+        bounds = DepthRange(front - np.float32(2 * hull.voxel_size), front + np.float32(behind * diagonal))
+    if box is not None:
+        entry, exit_ = box_depth(rig, camera, shape, box)
+        # Where a ray misses the box, both are NaN, and so are the bounds
+        low, high = np.maximum(bounds.near, entry), np.minimum(bounds.far, exit_)
+        missed = ~(high > low)
+        low[missed] = high[missed] = np.nan
+        bounds = DepthRange(low, high)
+    return bounds
+
+
+def box_depth(rig: Rig, camera: int, shape: tuple[int, int], box: Box) -> tuple[np.ndarray, np.ndarray]:
+    """Depths (H, W) float32, metres, where the rays of all pixels enter and leave a box; NaN where they miss it."""
+    y, x = np.mgrid[: shape[0], : shape[1]] + 0.5
+    origin, rays = rig.rays(camera, np.column_stack([x.ravel(), y.ravel()]))
+    rays /= (rays @ rig.viewing_directions[camera])[:, None]  # one unit of depth long
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ways = (np.asarray(box)[:, None] - origin) / rays
+    entry = np.maximum(np.nanmax(ways.min(axis=0), axis=1), 1e-6)
+    exit_ = np.nanmin(ways.max(axis=0), axis=1)
+    entry[exit_ <= entry] = np.nan
+    exit_[np.isnan(entry)] = np.nan
+    return entry.reshape(shape).astype(np.float32), exit_.reshape(shape).astype(np.float32)
 
 
 def hull_depth(rig: Rig, camera: int, shape: tuple[int, int], hull: Voxels) -> np.ndarray:

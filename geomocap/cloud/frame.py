@@ -6,24 +6,24 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import open3d as o3d
 
 from geomocap.cameras import Rig
-from geomocap.cloud.bounds import depth_range, inside_silhouettes
+from geomocap.cloud.bounds import Box, depth_range, inside_silhouettes
+from geomocap.cloud.evidence import Evidence, evidence_of
 from geomocap.cloud.groups import MatchGroup, MatchGroups
+from geomocap.cloud.images import PreparedImages, prepare
+from geomocap.cloud.intersection import intersect
 from geomocap.cloud.merging import Layer, merge
 from geomocap.cloud.points import MeasuredPoints
 from geomocap.cloud.settings import CloudSettings
-from geomocap.errors import GeometryError
 from geomocap.geometry import Voxels
 from geomocap.matching.growing import SurfaceMatches, grow
 from geomocap.matching.plane_sweep import SweepImages
-from geomocap.matching.seeds import find_seeds
-from geomocap.matching.spline import ImageStack
-from geomocap.matching.wallis import wallis
-from geomocap.triangulation import triangulate
+from geomocap.matching.seeds import DepthRange, find_seeds
+
+DENSE, COARSE = 1.5, 2.0  # distances of neighbouring points where one or several templates see the surface, pixels
 
 
 @dataclass(frozen=True)
@@ -33,17 +33,29 @@ class TemplateCloud:
     Attributes
     ----------
     group : MatchGroup
+        With the search cameras that were used in the end.
     surface : SurfaceMatches
     points : MeasuredPoints
         Of the cells `cells`, before merging.
     cells : (N,) int
         Cells of `surface.grid`.
+    evidence : Evidence
+    misfits : dict
+        Residuals, pixels, of the search cameras that were left out because they don't fit the calibration.
+    doubt : str
+        Why none of the matches was believed; empty if they were.
+    reasons : dict
+        What became of the cells and seeds, in words.
     """
 
     group: MatchGroup
     surface: SurfaceMatches
     points: MeasuredPoints
     cells: np.ndarray
+    evidence: Evidence
+    misfits: dict[int, float]
+    doubt: str
+    reasons: dict[str, int]
 
 
 @dataclass(frozen=True)
@@ -57,91 +69,19 @@ class CloudFrame:
     templates : tuple of TemplateCloud
     reasons : dict
         What became of all cells and seeds, in words, summed over the templates.
+    warnings : tuple of str
+        What looks wrong with cameras or images.
     """
 
     points: MeasuredPoints
     templates: tuple[TemplateCloud, ...]
     reasons: dict[str, int]
+    warnings: tuple[str, ...] = ()
 
     @property
     def cloud(self) -> o3d.t.geometry.PointCloud:
         """The cloud as Open3D holds it."""
         return self.points.to_open3d()
-
-
-@dataclass(frozen=True)
-class PreparedImages:
-    """Images of one frame, free of distortion, ready for matching.
-
-    Attributes
-    ----------
-    colors : list of (H, W, 3) uint8
-    filtered : list of (H, W) float32
-        Grey, after the Wallis filter.
-    masks : list of (H, W) bool or None
-        Where the subject is seen.
-    inner : list of (H, W) bool or None
-        The same without the margin along the contours.
-    stack : ImageStack
-    """
-
-    colors: list[np.ndarray]
-    filtered: list[np.ndarray]
-    masks: list[np.ndarray | None]
-    inner: list[np.ndarray | None]
-    stack: ImageStack
-
-
-def undistorted_color(image: np.ndarray, groups: MatchGroups, camera: int) -> np.ndarray:
-    """Return the colours (H, W, 3) of one camera's image as the matching sees them, without distortion."""
-    maps = groups.maps[camera]
-    return image if maps is None else cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR)
-
-
-def prepare(
-    images: Sequence[np.ndarray], masks: Sequence[np.ndarray] | None, groups: MatchGroups, settings: CloudSettings
-) -> PreparedImages:
-    """Remove distortion, filter, and prefilter the splines.
-
-    Raises
-    ------
-    GeometryError
-        If an image or mask does not have its camera's size.
-    """
-    if len(images) != len(groups.rig) or (masks is not None and len(masks) != len(images)):
-        given = len(images) if masks is None else f"{len(images)} and {len(masks)}"
-        raise GeometryError(f"{given} images and masks for {len(groups.rig)} cameras: expected one each a camera")
-    colors, filtered, silhouettes, inner = [], [], [], []
-    for c, (image, map_) in enumerate(zip(images, groups.maps, strict=True)):
-        image = np.asarray(image)
-        color = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
-        mask = None if masks is None else np.asarray(masks[c]) != 0
-        camera = groups.rig.cameras[c]
-        if (map_ is None and color.shape[:2] != (camera.height, camera.width)) or (
-            mask is not None and mask.shape != color.shape[:2]
-        ):
-            raise GeometryError(
-                f"camera {groups.rig.names[c]}: image {color.shape[:2]} and its mask have to be "
-                f"{camera.height}×{camera.width} as calibrated"
-            )
-        grey = color.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
-        if map_ is not None:
-            x, y = map_
-            pixels = np.column_stack([x.ravel(), y.ravel()]).astype(np.float64) + 0.5
-            grey = ImageStack.of([grey], settings.kernel.order).sample(0, pixels).reshape(x.shape)
-            outside = ~np.isfinite(grey)
-            grey = np.where(outside, np.float32(0), grey)
-            color = undistorted_color(color, groups, c)
-            if mask is not None:
-                mask = cv2.remap(mask.astype(np.uint8), x, y, cv2.INTER_NEAREST) != 0
-            mask = ~outside if mask is None else mask & ~outside
-        filtered.append(wallis(grey, settings.wallis, mask) if settings.wallis.enabled else grey)
-        colors.append(color)
-        silhouettes.append(mask)
-        kernel = np.ones((2 * settings.contour_margin + 1,) * 2, np.uint8)
-        inner.append(None if mask is None else cv2.erode(mask.astype(np.uint8), kernel) != 0)
-    stack = ImageStack.of(filtered, settings.kernel.order, inner)
-    return PreparedImages(colors, filtered, silhouettes, inner, stack)
 
 
 def cloud_of_frame(
@@ -151,6 +91,7 @@ def cloud_of_frame(
     rig: Rig,
     groups: MatchGroups,
     settings: CloudSettings | None = None,
+    box: Box | None = None,
 ) -> CloudFrame:
     """Measure the surface that the images of one frame show.
 
@@ -166,6 +107,8 @@ def cloud_of_frame(
     groups : MatchGroups
         From `match_groups(rig, settings.groups)`.
     settings : CloudSettings, optional
+    box : ((x, y, z), (x, y, z)), optional
+        Corners of the region of interest, metres, world; nothing is measured outside.
 
     Returns
     -------
@@ -179,124 +122,147 @@ def cloud_of_frame(
     """
     settings = settings or CloudSettings()
     prepared = prepare(images, masks, groups, settings)
-    templates = []
-    reasons: Counter[str] = Counter()
-    for group in groups.groups:
-        measured, counts = measure_template(prepared, masks is not None, hull, groups.rig, group, settings)
-        templates.append(measured)
-        reasons.update(counts)
-    layers = [
-        Layer(t.points, t.cells, t.surface.grid, t.surface.planes, t.group.template, settings.growing.step)
-        for t in templates
+    scene = Scene(prepared, masks is not None, hull, box, groups.rig)
+    templates = [
+        measure_template(scene, group, grid_step(groups, group, settings), settings) for group in groups.groups
     ]
-    kept = (
-        merge(layers, groups.rig, settings.merge)
-        if len(layers) > 1
-        else [np.ones(len(t.points), bool) for t in templates]
+    for group in groups.spare:
+        # The template that was chosen shows nothing: another may
+        if any(len(t.points) for t in templates):
+            break
+        templates.append(measure_template(scene, group, grid_step(groups, group, settings), settings))
+    kept = merge(
+        [Layer(t.points, t.cells, t.surface.grid, t.surface.planes, t.group.template) for t in templates],
+        groups.rig,
+        settings.merge,
     )
-    for _t, k in zip(templates, kept, strict=True):
-        if (~k).any():
-            reasons["measured better from another template"] += int((~k).sum())
+    reasons: Counter[str] = Counter()
+    for t, k in zip(templates, kept, strict=True):
+        reasons.update(t.reasons)
+        reasons["measured better from another template"] += int((~k).sum())
     points = MeasuredPoints.join([t.points.select(k) for t, k in zip(templates, kept, strict=True)])
-    return CloudFrame(points, tuple(templates), dict(reasons))
+    warnings = warnings_of(templates, rig.names, settings)
+    return CloudFrame(points, tuple(templates), {r: n for r, n in reasons.items() if n}, warnings)
 
 
-def measure_template(
-    prepared: PreparedImages, has_masks: bool, hull: Voxels | None, rig: Rig, group: MatchGroup, settings: CloudSettings
-) -> tuple[TemplateCloud, dict[str, int]]:
-    """Match one template group and intersect its rays; also returns what became of its cells."""
-    t, searches = group.template, group.searches
+def grid_step(groups: MatchGroups, group: MatchGroup, settings: CloudSettings) -> float:
+    """Distance of neighbouring points in the template image of a group, pixels."""
+    if settings.spacing is not None:
+        focal = groups.rig.cameras[group.template].mean_focal_length()
+        return max(settings.spacing * focal / group.depth, 1.0)
+    # Where several templates see a surface it gets more points than one template's
+    return settings.growing.step or (DENSE if len(groups.groups) == 1 else COARSE)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What all templates of a frame share.
+
+    Attributes
+    ----------
+    images : PreparedImages
+    has_masks : bool
+        Whether the masks are silhouettes.
+    hull : Voxels or None
+    box : Box or None
+    rig : Rig
+        Pinhole cameras.
+    """
+
+    images: PreparedImages
+    has_masks: bool
+    hull: Voxels | None
+    box: Box | None
+    rig: Rig
+
+
+def measure_template(scene: Scene, group: MatchGroup, step: float, settings: CloudSettings) -> TemplateCloud:
+    """Match one template group at points `step` pixels apart and intersect its rays."""
+    prepared, rig, t = scene.images, scene.rig, group.template
+    shape = prepared.filtered[t].shape
+    depth = depth_range(rig, t, shape, group.near, group.far, scene.hull, settings.hull_depth, scene.box)
     mask = prepared.inner[t]
-    depth = depth_range(rig, t, prepared.filtered[t].shape, group.near, group.far, hull, settings.hull_depth)
-    if hull is not None:
-        # The hull hides nothing of the subject: where it is not, nothing is to be found
+    if scene.hull is not None or scene.box is not None:
+        # Neither hides anything of the subject: where they are not, nothing is to be found
         mask = np.isfinite(depth.near) if mask is None else mask & np.isfinite(depth.near)
-    focal = rig.cameras[t].mean_focal_length()
-    used = [t, *searches.tolist()]
-    smooth = SweepImages.of(
-        [prepared.filtered[i] for i in used], [prepared.inner[i] for i in used], settings.seeds.blur
-    )
-    seeds = find_seeds(prepared.filtered[t], mask, smooth, group.transfers, depth, focal, settings.seeds)
-    surface = grow(
-        prepared.stack,
-        t,
-        searches,
-        group.transfers,
-        seeds,
-        mask,
-        settings.growing,
-        settings.kernel,
-        min(settings.least_views - 1, len(searches)),
-        smooth,
-        focal,
-    )
-    points, cells = intersect(prepared, rig, surface, settings)
+    surface, evidence = match_template(prepared, mask, depth, rig, group, step, settings)
+    misfits: dict[int, float] = {}
+    fits = ~(evidence.residuals > settings.trust.residual)
+    if not fits.all() and fits.any():
+        # What such an image said of depths is wrong as well: the others once more without it
+        misfits = dict(zip(group.searches[~fits].tolist(), evidence.residuals[~fits].tolist(), strict=True))
+        group = group.select(fits)
+        surface, evidence = match_template(prepared, mask, depth, rig, group, step, settings)
+    doubt = evidence.doubt(settings.trust) if surface.matched.any() else ""
     reasons = Counter(surface.reasons)
-    if has_masks:
+    if doubt:
+        reasons["not believed"] = reasons.pop("matched", 0)
+        surface = surface.without_matches()
+    points, cells = intersect(prepared, rig, surface, settings.normal_radius)
+    if scene.has_masks:
         inside = inside_silhouettes(rig, prepared.masks, points.positions, settings.silhouette_margin)
         reasons["outside another silhouette"] += int((~inside).sum())
         points, cells = points.select(inside), cells[inside]
     reasons["matched"] = len(points)
-    if len(searches) > 1:
+    if len(group.searches) > 1:
         # Of the matched: where this is nearly all, one camera is out of focus, blocked or wrongly calibrated
         reasons["matched in one search image only"] = int((points.views == 2).sum())
-    return TemplateCloud(group, surface, points, cells), {k: v for k, v in reasons.items() if v}
+    counts = {reason: number for reason, number in reasons.items() if number}
+    return TemplateCloud(group, surface, points, cells, evidence, misfits, doubt, counts)
 
 
-def intersect(
-    prepared: PreparedImages, rig: Rig, surface: SurfaceMatches, settings: CloudSettings
-) -> tuple[MeasuredPoints, np.ndarray]:
-    """Intersect the rays of all matched cells: points and their cells."""
-    t = surface.template
-    cells = np.flatnonzero(surface.matched)
-    if len(cells) == 0:
-        return MeasuredPoints.empty(), cells
-    m, seen = surface.matches, surface.seen[cells]
-    # Half of the noise that the matches suffer from is the template's
-    affine, covariance = m.affine[cells], m.covariance[cells]
-    back = np.linalg.inv(np.where(seen[..., None, None], affine, np.eye(2)))
-    own = 0.5 * back @ covariance @ np.swapaxes(back, -1, -2) * seen[..., None, None]
-    own = own.sum(axis=1) / seen.sum(axis=1)[:, None, None]
-    pixels = np.concatenate([surface.grid.pixels[None, cells], m.positions[cells].transpose(1, 0, 2)])
-    covariances = np.concatenate([own[None], 0.5 * covariance.transpose(1, 0, 2, 3)])
-    everywhere = np.concatenate([np.ones((1, len(cells)), bool), seen.T])
-    found = triangulate(rig.select([rig.names[i] for i in (t, *surface.searches)]), pixels, covariances, everywhere)
-    normals = surface_normals(rig, surface, settings.normal_radius)[cells]
-    correlation = np.where(seen, m.correlation[cells], 0).sum(axis=1) / seen.sum(axis=1)
-    row, column = (surface.grid.pixels[cells, ::-1].T).astype(int)
-    points = MeasuredPoints(
-        found.points,
-        normals,
-        prepared.colors[t][row, column],
-        found.sigma,
-        found.views.astype(np.int32),
-        correlation,
-        np.full(len(cells), t, np.int32),
+def match_template(
+    prepared: PreparedImages,
+    mask: np.ndarray | None,
+    depth: DepthRange,
+    rig: Rig,
+    group: MatchGroup,
+    step: float,
+    settings: CloudSettings,
+) -> tuple[SurfaceMatches, Evidence]:
+    """Find seeds, grow from them, and see whether the result can be believed."""
+    t, searches, transfers = group.template, group.searches, group.transfers
+    used = [t, *searches.tolist()]
+    smooth = SweepImages.of(
+        [prepared.filtered[i] for i in used], [prepared.inner[i] for i in used], settings.seeds.blur
     )
-    good = np.isfinite(found.points).all(axis=1) & np.isfinite(found.sigma)
-    return points.select(good), cells[good]
+    focal = rig.cameras[t].mean_focal_length()
+    seeds = find_seeds(prepared.filtered[t], mask, smooth, transfers, depth, focal, settings.seeds)
+    growing = settings.growing.model_copy(update={"step": step})
+    least = min(settings.least_views - 1, len(searches))
+    surface = grow(prepared.stack, t, searches, transfers, seeds, mask, growing, settings.kernel, least)
+    evidence = evidence_of(prepared.stack, surface, transfers, settings.kernel, growing.radius, settings.seeds.cell)
+    return surface, evidence
 
 
-def surface_normals(rig: Rig, surface: SurfaceMatches, radius: int) -> np.ndarray:
-    """Normals (N, 3) of all cells, world, towards the template camera; NaN where not matched.
-
-    On a plane n · X = 1 in camera axes the inverse depth is n · x̃, with x̃ the normalized image coordinates: n follows
-    from the inverse depth and its slopes, which are averaged over the matched cells within `radius` in the grid.
-    """
-    camera = rig.cameras[surface.template]
-    grid, planes = surface.grid, surface.planes
-    known = grid.image(np.where(surface.matched, 1.0, 0.0), 0.0)
-    size = (2 * radius + 1,) * 2
-    count = cv2.boxFilter(known, cv2.CV_64F, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    slopes = []
-    for i in (1, 2):
-        values = grid.image(np.nan_to_num(planes[:, i]), 0.0) * known
-        total = cv2.boxFilter(values, cv2.CV_64F, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        slopes.append((total / np.maximum(count, 1))[grid.row, grid.column])
-    x = np.asarray(camera.cam_from_img(grid.pixels)).reshape(-1, 2)
-    nx = slopes[0] * camera.focal_length_x
-    ny = slopes[1] * camera.focal_length_y
-    n = -np.column_stack([nx, ny, planes[:, 0] - nx * x[:, 0] - ny * x[:, 1]])
-    with np.errstate(invalid="ignore"):
-        n /= np.linalg.norm(n, axis=1, keepdims=True)
-    return n @ rig.cam_from_world[surface.template, :, :3]
+def warnings_of(templates: Sequence[TemplateCloud], names: Sequence[str], settings: CloudSettings) -> tuple[str, ...]:
+    """Say what looks wrong with cameras and images, the same camera once."""
+    warnings = []
+    took_part, matched = Counter[int](), Counter[int]()
+    for t in templates:
+        name = names[t.group.template]
+        if t.doubt:
+            warnings.append(
+                f"camera {name} as template: {t.doubt}; none of its points is kept: check calibration and images"
+            )
+        residuals = t.misfits | dict(zip(t.group.searches.tolist(), t.evidence.residuals.tolist(), strict=True))
+        for camera, residual in residuals.items():
+            if residual > settings.trust.warning and not t.doubt:
+                kept = "not used" if camera in t.misfits else "kept"
+                warnings.append(
+                    f"cameras {name} and {names[camera]}: matches leave their epipolar lines by {residual:.2f} px "
+                    f"({kept}): check the calibration"
+                )
+        seen = t.surface.seen.sum(axis=0)
+        for camera, number in zip(t.group.searches.tolist(), seen.tolist(), strict=True):
+            matched[camera] += number
+        for camera in (t.group.template, *residuals):
+            took_part[camera] += 1
+        matched[t.group.template] += int(t.surface.matched.sum())
+    for camera in sorted(took_part):
+        if matched[camera] == 0 and not any(t.doubt for t in templates):
+            warnings.append(
+                f"camera {names[camera]}: nothing matches in its images; is it black, blocked, out of focus, or its "
+                "calibration wrong?"
+            )
+    return tuple(warnings)

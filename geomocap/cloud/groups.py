@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,6 +22,8 @@ class MatchGroup:
     searches : (K,) int
     transfers : (K, 12) float
         Their epipolar geometry (`matching.epipolar`).
+    depth : float
+        Of the scene's middle, metres.
     near, far : float
         Depths between which the scene lies, metres.
     """
@@ -29,8 +31,13 @@ class MatchGroup:
     template: int
     searches: np.ndarray
     transfers: np.ndarray
+    depth: float
     near: float
     far: float
+
+    def select(self, which: np.ndarray) -> MatchGroup:
+        """Return the group with the search cameras `which`, (K,) bool, alone."""
+        return replace(self, searches=self.searches[which], transfers=self.transfers[which])
 
 
 @dataclass(frozen=True)
@@ -44,11 +51,14 @@ class MatchGroups:
     maps : tuple of (map_x, map_y) or None
         Where their pixels come from; None for cameras without distortion.
     groups : tuple of MatchGroup
+    spare : tuple of MatchGroup
+        To fall back on where one template alone is used and shows nothing.
     """
 
     rig: Rig
     maps: tuple[tuple[np.ndarray, np.ndarray] | None, ...]
     groups: tuple[MatchGroup, ...]
+    spare: tuple[MatchGroup, ...] = ()
 
 
 def scene_center(rig: Rig) -> np.ndarray:
@@ -85,12 +95,13 @@ def match_groups(rig: Rig, settings: GroupSettings | None = None) -> MatchGroups
     rays /= distance[:, None]
     angles = np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)))
     groups = []
-    for t in _templates(rig, angles, settings):
+    templates, spare = _templates(rig, angles, settings)
+    for t in templates + spare:
         searches = _searches(rig, t, angles, settings)
         if len(searches):
             T = transfers(pinhole, t, searches.tolist())
             depth = float((center - rig.centers[t]) @ rig.viewing_directions[t])
-            groups.append(MatchGroup(t, searches, T, settings.near * depth, settings.far * depth))
+            groups.append(MatchGroup(t, searches, T, depth, settings.near * depth, settings.far * depth))
     if not groups:
         off = angles[~np.eye(len(rig), dtype=bool)]
         raise CalibrationError(
@@ -99,17 +110,20 @@ def match_groups(rig: Rig, settings: GroupSettings | None = None) -> MatchGroups
             f"{settings.greatest_angle:g}°; widen groups.least_angle and groups.greatest_angle or add cameras between"
         )
     maps = tuple(None if c.is_undistorted() else rig.undistortion_map(i) for i, c in enumerate(rig.cameras))
-    return MatchGroups(pinhole, maps, tuple(groups))
+    count = max(sum(g.template in templates for g in groups), 1)
+    return MatchGroups(pinhole, maps, tuple(groups[:count]), tuple(groups[count:]))
 
 
-def _templates(rig: Rig, angles: np.ndarray, settings: GroupSettings) -> list[int]:
+def _templates(rig: Rig, angles: np.ndarray, settings: GroupSettings) -> tuple[list[int], list[int]]:
+    """Choose the templates, and those to fall back on."""
     if settings.template_camera is not None and settings.template_camera not in rig.names:
         raise CalibrationError(f"template camera {settings.template_camera}: the rig has {', '.join(rig.names)}")
     if settings.templates == "all" or (settings.templates == "auto" and len(rig) > 3):
-        return list(range(len(rig)))
+        return list(range(len(rig))), []
     if settings.template_camera is not None:
-        return [rig.names.index(settings.template_camera)]
-    return [int(np.argmin(angles.max(axis=1)))]
+        return [rig.names.index(settings.template_camera)], []
+    central, *others = np.argsort(angles.max(axis=1), kind="stable").tolist()
+    return [central], others if settings.templates == "auto" else []
 
 
 def _searches(rig: Rig, template: int, angles: np.ndarray, settings: GroupSettings) -> np.ndarray:

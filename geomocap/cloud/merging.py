@@ -34,8 +34,6 @@ class Layer:
         Inverse depth and slopes of all cells.
     template : int
         Camera.
-    step : float
-        Distance of neighbouring cells, pixels.
     """
 
     points: MeasuredPoints
@@ -43,7 +41,6 @@ class Layer:
     grid: Grid
     planes: np.ndarray
     template: int
-    step: float
 
 
 def merge(layers: list[Layer], rig: Rig, settings: MergeSettings | None = None) -> list[np.ndarray]:
@@ -61,6 +58,8 @@ def merge(layers: list[Layer], rig: Rig, settings: MergeSettings | None = None) 
     list of (N,) bool, one for each layer
     """
     settings = settings or MergeSettings()
+    if len(layers) == 1:
+        return [np.ones(len(layers[0].points), bool)]
     scores = [_score(layer, rig) for layer in layers]
     maps = [_score_map(layer, score) for layer, score in zip(layers, scores, strict=True)]
     kept = []
@@ -81,9 +80,9 @@ def merge(layers: list[Layer], rig: Rig, settings: MergeSettings | None = None) 
             mu = other.planes[c, 0] + np.einsum("ni,ni->n", other.planes[c, 1:3], offset[n])
             surface = 1 / np.maximum(mu, 1e-6)
             z = depth[other.template, n, 2]
-            spacing = other.step * z / rig.cameras[other.template].mean_focal_length()
+            spacing = other.grid.step * z / rig.cameras[other.template].mean_focal_length()
             # Where either looks at the surface at a slant, a step in the image is a long way in depth
-            slant = np.linalg.norm(other.planes[c, 1:3], axis=1) * other.step / np.maximum(mu, 1e-6) * z
+            slant = np.linalg.norm(other.planes[c, 1:3], axis=1) * other.grid.step / np.maximum(mu, 1e-6) * z
             tolerance = settings.distance or (3 * spacing + 3 * layer.points.sigma[n] + slant)
             same = np.abs(z - surface) <= tolerance
             support[n] += same
@@ -116,7 +115,7 @@ def _cell_at(layer: Layer, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cell nearest to each pixel (N, 2), -1 where there is none, and the way from it to the pixel."""
     number = layer.grid.image(np.arange(len(layer.grid)), -1)
     with np.errstate(invalid="ignore"):
-        place = np.rint((pixels - 0.5) / layer.step - 0.5)
+        place = np.rint((pixels - 0.5) / layer.grid.step - 0.5)
     with np.errstate(invalid="ignore"):
         inside = np.asarray(((place >= 0) & (place < np.array(number.shape)[::-1])).all(axis=1))
     cell = np.full(len(pixels), -1, np.int64)

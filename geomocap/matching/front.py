@@ -6,7 +6,7 @@ that the result does not depend on the number of threads.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -14,9 +14,8 @@ import numpy as np
 from geomocap.matching import grow_kernel as gk
 from geomocap.matching import patch_kernel as pk
 from geomocap.matching.grid import Grid
-from geomocap.matching.plane_sweep import SweepImages, tilt_planes
 from geomocap.matching.seeds import Seeds
-from geomocap.matching.settings import GrowingSettings, KernelSettings, SeedSettings
+from geomocap.matching.settings import GrowingSettings, KernelSettings
 from geomocap.matching.spline import ImageStack
 
 _LEFT, _RIGHT, _ABOVE, _BELOW = range(4)
@@ -47,16 +46,14 @@ class Front:
 
     Attributes
     ----------
+    points : (N, 2) float
+        Cells in the template image, array indices.
     position, affine, quality : (N, K, 2), (N, K, 4), (N, K, COLUMNS) float
         Matches, array indices.
     planes : (N, PLANE) float
         Planes of matched cells.
     tries : (N,) int
         Rounds in which a cell was tried in vain.
-    smooth : SweepImages, optional
-        For trying tilted planes.
-    focal : float
-        Camera constant of the template, pixels.
     """
 
     grid: Grid
@@ -66,14 +63,12 @@ class Front:
     transfers: np.ndarray
     limits: np.ndarray
     settings: GrowingSettings
+    points: np.ndarray
     position: np.ndarray
     affine: np.ndarray
     quality: np.ndarray
     planes: np.ndarray
     tries: np.ndarray
-    smooth: SweepImages | None = None
-    focal: float = 0.0
-    seeds: SeedSettings = field(default_factory=SeedSettings)
 
     @classmethod
     def over(
@@ -86,8 +81,6 @@ class Front:
         settings: GrowingSettings,
         kernel: KernelSettings,
         least_images: int = 1,
-        smooth: SweepImages | None = None,
-        focal: float = 0.0,
     ) -> Front:
         """Begin with no cell matched."""
         n, k = len(grid), len(searches)
@@ -95,8 +88,16 @@ class Front:
         quality[..., pk.STATUS] = pk.UNTRIED
         limits = limits_of(settings, kernel, least_images)
         transfers = np.ascontiguousarray(transfers, dtype=np.float64)
-        state = np.zeros((n, k, 2)), np.zeros((n, k, 4)), quality, np.zeros((n, gk.PLANE)), np.zeros(n, np.int64)
-        return cls(grid, images, template, searches, transfers, limits, settings, *state, smooth, focal)
+        points = np.ascontiguousarray(grid.pixels - 0.5)
+        state = (
+            points,
+            np.zeros((n, k, 2)),
+            np.zeros((n, k, 4)),
+            quality,
+            np.zeros((n, gk.PLANE)),
+            np.zeros(n, np.int64),
+        )
+        return cls(grid, images, template, searches, transfers, limits, settings, *state)
 
     @property
     def matched(self) -> np.ndarray:
@@ -119,64 +120,22 @@ class Front:
 
     def step(self, sources: np.ndarray, targets: np.ndarray) -> None:
         """Match cells `targets` (M,), each once, from the planes of cells `sources` (M,)."""
-        self._attempt(targets, self.planes[sources].copy(), self.grid.pixels[sources] - 0.5)
+        self._attempt(targets, self.planes[sources], self.points[sources])
 
-    def _attempt(self, targets: np.ndarray, planes: np.ndarray, origins: np.ndarray) -> None:
-        """Match cells from planes that hold at `origins` (M, 2), adapting where the quality is poor."""
-        points = self.grid.pixels[targets] - 0.5
-        radius = self.settings.radius
-        left = self._match(targets, moved(planes, points - origins), points, radius, first=True)
-        # A larger patch where texture is short, a smaller one where the surface is not plane enough
-        reason = self.quality[targets, :, pk.STATUS]
-        short = ((reason == pk.LOW_TEXTURE) | (reason == pk.PRECISION)).any(axis=1)
-        for other, which in (
-            (round(radius * self.settings.larger), short),
-            (max(round(radius / self.settings.larger), 3), ~short),
-        ):
-            chosen = left[which[left]]
-            if other != radius and len(chosen):
-                rest = self._match(targets[chosen], moved(planes, points - origins)[chosen], points[chosen], other)
-                done = np.setdiff1d(chosen, chosen[rest], assume_unique=True)
-                left = np.setdiff1d(left, done, assume_unique=True)
-        # A smaller shift: a point half way hands its own plane on
-        left = left[np.abs(points - origins)[left].max(axis=1, initial=0) > 0.5]
-        if len(left):
-            middle = 0.5 * (points + origins)[left]
-            half = moved(planes[left], middle - origins[left])
-            found = self._run(middle, half, radius)
-            good = found[:, gk.IMAGES] > 0
-            left, middle, found = left[good], middle[good], found[good]
-            self._match(targets[left], moved(found, points[left] - middle), points[left], radius)
-        self.tries[targets] += ~self.matched[targets]
+    def _attempt(self, targets: np.ndarray, planes: np.ndarray, origins: np.ndarray, hole: bool = False) -> None:
+        """Match cells from planes that hold at `origins` (M, 2), adapting where the quality is poor.
 
-    def _match(
-        self, targets: np.ndarray, planes: np.ndarray, points: np.ndarray, radius: int, first: bool = False
-    ) -> np.ndarray:
-        """Match cells from their planes, keep what passes, and return the numbers of the others."""
-        out = self._buffers(len(targets))
-        planes = self._run(points, planes, radius, out)
-        good = planes[:, gk.IMAGES] > 0
-        store = np.ones(len(good), bool) if first else good
-        self.quality[targets[store]] = out[2][store]
-        self.position[targets[good]], self.affine[targets[good]] = out[0][good], out[1][good]
-        self.planes[targets[good]] = planes[good]
-        return np.flatnonzero(~good)
-
-    def _buffers(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        k = len(self.searches)
-        return np.zeros((count, k, 2)), np.zeros((count, k, 4)), np.zeros((count, k, pk.COLUMNS))
-
-    def _run(self, points: np.ndarray, planes: np.ndarray, radius: int, out: tuple | None = None) -> np.ndarray:
-        images = self.images
-        out = out or self._buffers(len(points))
-        planes = np.ascontiguousarray(planes)
-        if len(points) == 0:
-            return planes
+        Holes are where the surface bends: they are tried with the smaller patch, and without shifts half way.
+        """
+        if len(targets) == 0:
+            return
+        images, settings = self.images, self.settings
+        larger, smaller = round(settings.radius * settings.larger), max(round(settings.radius / settings.larger), 3)
         # A handful of points is not worth waking the other threads for
         threads = numba.get_num_threads()
-        numba.set_num_threads(threads if len(points) > _FEW else 1)
+        numba.set_num_threads(threads if len(targets) > _FEW else 1)
         try:
-            gk.match_points(
+            gk.match_cells(
                 images.flat,
                 images.masks,
                 images.layout,
@@ -185,14 +144,20 @@ class Front:
                 self.searches,
                 self.transfers,
                 self.limits,
-                np.ascontiguousarray(points),
-                radius,
-                planes,
-                *out,
+                self.points,
+                targets,
+                np.ascontiguousarray(origins),
+                np.ascontiguousarray(planes),
+                np.array([smaller if hole else settings.radius, larger, smaller]),
+                not hole,
+                self.planes,
+                self.position,
+                self.affine,
+                self.quality,
             )
         finally:
             numba.set_num_threads(threads)
-        return planes
+        self.tries[targets] += ~self.matched[targets]
 
     # --- orders ---
 
@@ -202,25 +167,17 @@ class Front:
         In each round, of all cells that border on matched ones, the half with the better neighbours is tried, each from
         its best neighbour.
         """
-        at = self.grid.neighbours[:, :4]
         # What a cell was last tried from; it is not tried from the same again
         last = np.full(len(self.grid), -1, np.int64)
+        source, key = np.full(len(self.grid), -1, np.int64), np.zeros(len(self.grid))
         while True:
-            matched = self.matched
-            keys = np.where(matched, self.planes[:, gk.KEY], -np.inf)
-            open_ = np.flatnonzero(~matched & (self.tries < self.settings.attempts))
-            around = at[open_]
-            key = np.where(around >= 0, keys[around], -np.inf)
-            best = key.argmax(axis=1)
-            source = around[np.arange(len(open_)), best]
-            key = key[np.arange(len(open_)), best]
-            usable = (key > -np.inf) & (source != last[open_])
-            if not usable.any():
+            gk.best_neighbours(self.grid.neighbours, self.planes, self.tries, self.settings.attempts, last, source, key)
+            targets = np.flatnonzero(source >= 0)
+            if len(targets) == 0:
                 return
-            targets, source, key = open_[usable], source[usable], key[usable]
-            front = key >= np.median(key)
-            last[targets[front]] = source[front]
-            self.step(source[front], targets[front])
+            targets = targets[key[targets] >= np.median(key[targets])]
+            last[targets] = source[targets]
+            self.step(source[targets], targets)
 
     def sequential(self, region: np.ndarray, begin: np.ndarray) -> None:
         """Cover each region as the paper does: horizontal shifts from the seed, vertical ones from each of that row."""
@@ -256,7 +213,7 @@ class Front:
             ahead = neighbours[ahead, direction]
 
     def fill_holes(self, passes: int) -> None:
-        """Try what is left from all directions: from the mean plane of all matched neighbours, then from each."""
+        """Try what is left from all directions: from the mean plane of all matched neighbours."""
         at = self.grid.neighbours
         fresh = self.matched
         for _ in range(passes):
@@ -266,45 +223,7 @@ class Front:
             if len(targets) == 0:
                 return
             self._from_mean(targets, around[targets])
-            for direction in range(min(self.settings.attempts, 8)):
-                # The neighbours of each cell, best first
-                left = targets[~self.matched[targets]]
-                key = np.where(around[left], self.planes[at[left], gk.KEY], -np.inf)
-                choice = np.argsort(-key, axis=1, kind="stable")[:, direction]
-                there = np.take_along_axis(key, choice[:, None], axis=1)[:, 0] > -np.inf
-                self.step(at[left, choice][there], left[there])
-            if self.settings.tilting and self.smooth is not None:
-                left = np.flatnonzero(~self.matched[targets])
-                self._tilted(targets[left], around[targets[left]])
             fresh = self.matched & ~matched
-
-    def _tilted(self, targets: np.ndarray, around: np.ndarray) -> None:
-        """Turn the plane of the best neighbour to where the images correlate best, as beyond an edge of the surface."""
-        if self.smooth is None or len(targets) == 0:
-            return
-        at = self.grid.neighbours[targets]
-        best = np.where(around, self.planes[at, gk.KEY], -np.inf).argmax(axis=1)
-        source = at[np.arange(len(at)), best]
-        points = self.grid.pixels[targets] - 0.5
-        planes = moved(self.planes[source], self.grid.pixels[targets] - self.grid.pixels[source])
-        smooth, correlation = self.smooth, np.zeros(len(targets))
-        tilt_planes(
-            smooth.flat,
-            smooth.seen,
-            smooth.shapes,
-            smooth.starts,
-            self.transfers,
-            points,
-            planes,
-            self.focal,
-            self.settings.radius,
-            1.0,
-            self.seeds.tilt,
-            self.seeds.tilts,
-            correlation,
-        )
-        good = correlation >= self.seeds.correlation
-        self._attempt(targets[good], planes[good], points[good])
 
     def _from_mean(self, targets: np.ndarray, around: np.ndarray) -> None:
         at = self.grid.neighbours[targets]
@@ -312,7 +231,7 @@ class Front:
         planes = self.planes[at]
         planes = moved(planes.reshape(-1, gk.PLANE), offset.reshape(-1, 2)).reshape(planes.shape)
         mean = (planes * around[..., None]).sum(axis=1) / around.sum(axis=1)[:, None]
-        self._attempt(targets, mean, self.grid.pixels[targets] - 0.5)
+        self._attempt(targets, mean, self.points[targets], hole=True)
 
 
 def moved(planes: np.ndarray, way: np.ndarray) -> np.ndarray:

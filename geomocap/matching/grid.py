@@ -22,6 +22,8 @@ class Grid:
     shape : (rows, columns)
     neighbours : (N, 8) int
         Cells left, right, above, below, then the diagonals; -1 where there is none.
+    step : float
+        Distance of neighbouring cells, pixels.
     """
 
     pixels: np.ndarray
@@ -29,6 +31,7 @@ class Grid:
     column: np.ndarray
     shape: tuple[int, int]
     neighbours: np.ndarray
+    step: float
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -48,7 +51,7 @@ class Grid:
         number[row + 1, column + 1] = np.arange(len(row))
         neighbours = np.column_stack([number[row + 1 + dy, column + 1 + dx] for dy, dx in _DIRECTIONS])
         pixels = np.column_stack([xs[column], ys[row]])
-        return cls(pixels, row, column, inside.shape, neighbours.reshape(-1, 8))
+        return cls(pixels, row, column, inside.shape, neighbours.reshape(-1, 8), step)
 
     def image(self, values: np.ndarray, fill: float = np.nan) -> np.ndarray:
         """Spread values (N, …) of the cells over the grid: (rows, columns, …)."""

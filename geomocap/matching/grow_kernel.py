@@ -32,6 +32,8 @@ from geomocap.matching.spline import FAST
 MU, SLOPE_X, SLOPE_Y, KEY, IMAGES, PLANE = range(6)
 
 _CHUNK = 16
+_PATIENCE = 4
+_SHORT = 0.1  # what the correlation may lack of its limit after so many iterations
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
@@ -118,7 +120,7 @@ def match_point(stack, template, searches, transfers, limits, x, y, radius, plan
     for attempt in range(2):
         if not plane_start(transfers, x, y, plane, position, affine, point):
             return 0
-        match_patch(
+        survived = match_patch(
             flat,
             masks,
             layout,
@@ -134,26 +136,22 @@ def match_point(stack, template, searches, transfers, limits, x, y, radius, plan
             limits[TOLERANCE],
             limits[CONTRAST],
             limits[MAX_SHIFT],
+            _PATIENCE,
+            limits[MIN_CORRELATION] - _SHORT,
             wanted,
             position,
             affine,
             quality,
             kernel,
         )
-        if attempt == 0:
-            for k in range(images):
-                first[k] = quality[k, pk.STATUS]
-        tried = 0
-        for k in range(images):
-            tried += wanted[k]
         # A view alone with the template has nothing to contradict it: it has to be the better.
-        floor = limits[MIN_CORRELATION] if tried > 1 else limits[PAIR_CORRELATION]
+        floor = limits[MIN_CORRELATION] if survived > 1 else limits[PAIR_CORRELATION]
         passed = _gate(masks, layout, searches, limits, floor, wanted, position, quality)
         if attempt == 0:
             for k in range(images):
-                if wanted[k] == 0:
-                    first[k] = quality[k, pk.STATUS]
-        if passed == tried and passed >= limits[MIN_IMAGES]:
+                first[k] = quality[k, pk.STATUS]
+        # Images that fell out on the way had no say in the end; those that failed the thresholds had
+        if passed == survived and passed >= limits[MIN_IMAGES]:
             plane_of(transfers, x, y, position, affine, wanted, plane, point)
             plane[IMAGES] = passed
             key = 0.0
@@ -174,8 +172,16 @@ def match_point(stack, template, searches, transfers, limits, x, y, radius, plan
     return 0
 
 
+@njit(cache=True, nogil=True, fastmath=FAST)
+def carry(plane, dx, dy, out):
+    """Carry a plane (PLANE,) along a template offset."""
+    out[:] = plane
+    out[MU] += plane[SLOPE_X] * dx + plane[SLOPE_Y] * dy
+    out[IMAGES] = 0
+
+
 @njit(cache=True, nogil=True, parallel=True)
-def match_points(
+def match_cells(
     flat,
     masks,
     layout,
@@ -185,13 +191,17 @@ def match_points(
     transfers,
     limits,
     points,
-    radius,
+    cells,
+    origins,
+    starts,
+    radii,
+    half,
     planes,
     position,
     affine,
     quality,
 ):
-    """Match points, each for itself.
+    """Match cells, each once, from planes that hold near them, adapting where the quality is poor.
 
     Parameters
     ----------
@@ -200,33 +210,82 @@ def match_points(
     limits : (LIMITS,) float
         Thresholds.
     points : (N, 2) float
-        Template positions, array indices.
-    radius : int
-    planes : (N, PLANE) float
-        Planes expected; replaced by those found, with IMAGES = 0 where none was.
-    position, affine, quality : (N, K, 2), (N, K, 4), (N, K, COLUMNS) float
-        Written.
+        Template positions of all cells, array indices.
+    cells : (M,) int
+        The cells to match.
+    origins : (M, 2) float
+        Where the planes hold, array indices.
+    starts : (M, PLANE) float
+        Planes.
+    radii : (3,) int
+        Patch radius; the one where texture is short; the one where the surface is not plane enough.
+    half : bool
+        Whether a point half way is matched first where nothing else helps.
+    planes, position, affine, quality : (N, PLANE), (N, K, 2), (N, K, 4), (N, K, COLUMNS) float
+        Written for the cells; IMAGES = 0 where none matched, the reasons then those of the first try.
     """
     stack = (flat, masks, layout, order)
     images = len(searches)
-    count = len(points)
+    count = len(cells)
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
-        work = workspace(radius, images), np.zeros(images, np.uint8), np.zeros(6), np.zeros(images)
+        work = workspace(max(radii), images), np.zeros(images, np.uint8), np.zeros(6), np.zeros(images)
+        p, a, q = np.zeros((images, 2)), np.zeros((images, 4)), np.zeros((images, pk.COLUMNS))
+        plane, between = np.zeros(PLANE), np.zeros(PLANE)
         for n in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
-            x, y = points[n]
-            planes[n, IMAGES] = 0
-            match_point(
-                stack,
-                template,
-                searches,
-                transfers,
-                limits,
-                x,
-                y,
-                radius,
-                planes[n],
-                position[n],
-                affine[n],
-                quality[n],
-                work,
-            )
+            cell = cells[n]
+            x, y = points[cell]
+            dx = x - origins[n, 0]
+            dy = y - origins[n, 1]
+            planes[cell, IMAGES] = 0
+            radius = radii[0]
+            for attempt in range(3):
+                if attempt == 1 and radius == radii[0]:
+                    continue
+                if attempt < 2:
+                    carry(starts[n], dx, dy, plane)
+                else:
+                    # A smaller shift: a point half way hands its own plane on
+                    if not half or max(abs(dx), abs(dy)) <= 0.5:
+                        break
+                    radius = radii[0]
+                    mx = x - 0.5 * dx
+                    my = y - 0.5 * dy
+                    carry(starts[n], 0.5 * dx, 0.5 * dy, between)
+                    args = (stack, template, searches, transfers, limits, mx, my, radius, between, p, a, q, work)
+                    if match_point(*args) == 0:
+                        break
+                    carry(between, 0.5 * dx, 0.5 * dy, plane)
+                args = (stack, template, searches, transfers, limits, x, y, radius, plane, p, a, q, work)
+                found = match_point(*args)
+                if found > 0 or attempt == 0:
+                    quality[cell] = q
+                if found > 0:
+                    position[cell], affine[cell], planes[cell] = p, a, plane
+                    break
+                if attempt == 0:
+                    # A larger patch where texture is short, a smaller one where the surface is not plane enough
+                    radius = radii[2]
+                    for k in range(images):
+                        if q[k, pk.STATUS] == pk.LOW_TEXTURE or q[k, pk.STATUS] == pk.PRECISION:
+                            radius = radii[1]
+
+
+@njit(cache=True, nogil=True)
+def best_neighbours(neighbours, planes, tries, attempts, last, source, key):
+    """For every cell still to be tried, find the matched one of its four neighbours with the best key; else -1.
+
+    A cell is not tried again from `last` (N,), nor after `attempts` tries. Writes `source` and `key` (N,).
+    """
+    for n in range(len(source)):
+        source[n] = -1
+        if planes[n, IMAGES] > 0 or tries[n] >= attempts:
+            continue
+        top = -np.inf
+        for d in range(4):
+            m = neighbours[n, d]
+            if m >= 0 and planes[m, IMAGES] > 0 and planes[m, KEY] > top:
+                top = planes[m, KEY]
+                source[n] = m
+        if source[n] == last[n]:
+            source[n] = -1
+        key[n] = top

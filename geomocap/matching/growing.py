@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -13,10 +13,11 @@ from geomocap.matching import patch_kernel as pk
 from geomocap.matching.front import Front
 from geomocap.matching.grid import Grid
 from geomocap.matching.lsm import Matches, count_reasons, matches_of
-from geomocap.matching.plane_sweep import SweepImages
 from geomocap.matching.seeds import Seeds
 from geomocap.matching.settings import GrowingSettings, KernelSettings
 from geomocap.matching.spline import ImageStack
+
+STEP = 1.5  # distance of neighbouring cells if none is asked for, pixels
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,12 @@ class SurfaceMatches:
     seeds: Seeds
     reasons: dict[str, int]
 
+    def without_matches(self) -> SurfaceMatches:
+        """Return the same with all matches removed."""
+        none = np.zeros_like(self.matched)
+        removed = self.removed | self.matched
+        return replace(self, planes=np.full_like(self.planes, np.nan), matched=none, removed=removed)
+
     @property
     def seen(self) -> np.ndarray:
         """Which search images saw which cell, (N, K) bool."""
@@ -71,8 +78,6 @@ def grow(
     settings: GrowingSettings | None = None,
     kernel: KernelSettings | None = None,
     least_images: int = 1,
-    smooth: SweepImages | None = None,
-    focal: float = 0.0,
 ) -> SurfaceMatches:
     """Match the template densely, beginning at the seeds.
 
@@ -91,10 +96,6 @@ def grow(
         Its radius and greatest shift are not used, `settings` has its own.
     least_images : int
         Search images that have to see a point.
-    smooth : SweepImages, optional
-        Smoothed images of the group, for trying tilted planes at holes.
-    focal : float
-        Camera constant of the template, pixels; for the same.
 
     Returns
     -------
@@ -104,8 +105,8 @@ def grow(
     settings, kernel = settings or GrowingSettings(), kernel or KernelSettings()
     searches = np.asarray(searches, dtype=np.int64)
     height, width = (int(v) for v in images.layout[template, 2:])
-    grid = Grid.over((height, width), settings.step, mask)
-    front = Front.over(grid, images, template, searches, transfers, settings, kernel, least_images, smooth, focal)
+    grid = Grid.over((height, width), settings.step or STEP, mask)
+    front = Front.over(grid, images, template, searches, transfers, settings, kernel, least_images)
 
     # Voronoi regions of the seeds; each begins at the cell nearest to its seed
     region, begin = regions(grid, seeds)
@@ -164,7 +165,7 @@ def consistent(grid: Grid, matches: Matches, matched: np.ndarray, settings: Grow
     predicted = matches.positions[source] + np.einsum("nkij,nj->nki", matches.affine[source], offset)
     miss = np.linalg.norm(predicted - matches.positions[target], axis=-1)
     seen = matches.matched[source] & matches.matched[target]
-    limit = settings.agreement * np.linalg.norm(offset, axis=1) / settings.step
+    limit = settings.agreement * np.linalg.norm(offset, axis=1) / grid.step
     agree = seen.any(axis=1) & (~seen | (miss <= limit[:, None])).all(axis=1)
     # Agreement is mutual
     key = source * count + target
@@ -180,12 +181,13 @@ def consistent(grid: Grid, matches: Matches, matched: np.ndarray, settings: Grow
     _, label = connected_components(graph, directed=False)
     number = label.max(initial=0) + 1
     size = np.bincount(label[kept], minlength=number)
-    kept &= size[label] >= settings.minimum_patch
+    area = size * grid.step**2
+    kept &= area[label] >= settings.minimum_patch
     if matches.status.shape[1] > 1:
         # What no second image confirms may be chance, the more so with wrong cameras: only large patches are none
         several = kept & (matches.matched.sum(axis=1) > 1)
         confirmed = np.bincount(label[several], minlength=number) >= np.maximum(settings.confirmed * size, 1)
-        kept &= confirmed[label] | (size[label] >= settings.minimum_pair_patch)
+        kept &= confirmed[label] | (area[label] >= settings.minimum_pair_patch)
     return kept
 
 

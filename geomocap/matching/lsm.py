@@ -63,6 +63,8 @@ REASONS = (
 """What became of a point, by the number in `Matches.status`."""
 
 _CHUNK = 32
+_PATIENCE = 8
+_HOPELESS = 0.5
 
 
 @dataclass(frozen=True)
@@ -304,6 +306,8 @@ def _match_all(
                 tolerance,
                 minimum_contrast,
                 max_shift,
+                _PATIENCE,
+                _HOPELESS,
                 wanted,
                 position[n],
                 affine[n],

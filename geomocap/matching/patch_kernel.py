@@ -106,6 +106,8 @@ def match_patch(
     tolerance,
     minimum_contrast,
     max_shift,
+    patience,
+    hopeless,
     wanted,
     position,
     affine,
@@ -129,6 +131,9 @@ def match_patch(
         Least standard deviation of the template's grey levels.
     max_shift : float
         Farthest that a position may move from its start, pixels; 0: anywhere.
+    patience, hopeless : int, float
+        An image is given up whose correlation is below `hopeless` after `patience` iterations, or below half of it
+        after half as many.
     wanted : (K,) uint8
         1 for the search images to match in.
     position : (K, 2) float, affine : (K, 4) float
@@ -207,7 +212,10 @@ def match_patch(
             state[k, MEAN] += off
             state[k, VARIANCE] = ff * max(1.0 - correlation * correlation, 1e-8) / (count - 8)
             # What correlates with nothing after some steps will not come right
-            if not gain > 0 or (quality[k, ITERATIONS] >= 4 and correlation < 0.3):
+            done = quality[k, ITERATIONS]
+            if not gain > 0 or (
+                2 * done >= patience and correlation < (hopeless if done >= patience else hopeless / 2)
+            ):
                 quality[k, STATUS] = CORRELATION
                 use[k] = 0.0
                 continue

@@ -22,10 +22,17 @@ _VALUE = np.array([[1 / 6, 4 / 6, 1 / 6, 0, 0], [1 / 120, 26 / 120, 66 / 120, 26
 _SLOPE = np.array([[-1 / 2, 0, 1 / 2, 0, 0], [-1 / 24, -10 / 24, 0, 10 / 24, 1 / 24]], np.float32)
 
 
+@njit(cache=True, nogil=True, inline="always")
+def padded(n):
+    """Length of a row of `n` values in whole vectors; what is beyond has weight 0."""
+    return (n + 7) // 8 * 8
+
+
 @njit(cache=True, nogil=True, fastmath=FAST)
 def sample_template(flat, start, stride, order, ix, iy, radius, patches):
     """Fill patches[0:3] with value and slopes of the spline at the pixels around pixel (ix, iy), by separable sums."""
     n = 2 * radius + 1
+    wide = padded(n)
     base = start + (iy - radius - order // 2) * stride + ix - radius - order // 2
     w = _VALUE[order // 4]
     d = _SLOPE[order // 4]
@@ -34,14 +41,14 @@ def sample_template(flat, start, stride, order, ix, iy, radius, patches):
     for i in range(n + order - 1):
         row = base + i * stride
         if order == 3:
-            for j in range(n):
+            for j in range(wide):
                 p = flat[row + j]
                 c = flat[row + j + 1]
                 q = flat[row + j + 2]
                 value[i, j] = w[0] * (p + q) + w[1] * c
                 slope[i, j] = d[2] * (q - p)
         else:
-            for j in range(n):
+            for j in range(wide):
                 p = flat[row + j]
                 q = flat[row + j + 1]
                 c = flat[row + j + 2]
@@ -52,12 +59,12 @@ def sample_template(flat, start, stride, order, ix, iy, radius, patches):
     F, GX, GY = patches[0], patches[1], patches[2]
     for i in range(n):
         if order == 3:
-            for j in range(n):
+            for j in range(wide):
                 F[i, j] = w[0] * (value[i, j] + value[i + 2, j]) + w[1] * value[i + 1, j]
                 GX[i, j] = w[0] * (slope[i, j] + slope[i + 2, j]) + w[1] * slope[i + 1, j]
                 GY[i, j] = d[2] * (value[i + 2, j] - value[i, j])
         else:
-            for j in range(n):
+            for j in range(wide):
                 outer = value[i, j] + value[i + 4, j]
                 inner = value[i + 1, j] + value[i + 3, j]
                 F[i, j] = w[0] * outer + w[1] * inner + w[2] * value[i + 2, j]
@@ -78,6 +85,8 @@ def template_mask(masks, start, stride, ix, iy, radius, W):
             m = masks[base + i * stride + j]
             W[i, j] = _F4(m)
             count += m
+        for j in range(n, padded(n)):
+            W[i, j] = _ZERO
     return count
 
 
@@ -85,11 +94,12 @@ def template_mask(masks, start, stride, ix, iy, radius, W):
 def normal_equations(patches, radius, count, H, S, q1, qf, moments):
     """Centre F, form the 6×6 normal matrix from row moments and eliminate offset and gain; return Σ F²."""
     n = 2 * radius + 1
+    wide = padded(n)
     F, GX, GY, W = patches[0], patches[1], patches[2], patches[3]
     total = 0.0
     for i in range(n):
         row = _ZERO
-        for j in range(n):
+        for j in range(wide):
             row += F[i, j] * W[i, j]
         total += row
     mean = _F4(total / count)
@@ -103,7 +113,7 @@ def normal_equations(patches, radius, count, H, S, q1, qf, moments):
         y = float(i - radius)
         a0 = a1 = a2 = b0 = b1 = b2 = c0 = c1 = c2 = _ZERO
         u0 = u1 = v0 = v1 = s0 = s1 = t0 = t1 = fr = m0 = m2 = _ZERO
-        for j in range(n):
+        for j in range(wide):
             x = _F4(j - radius)
             w = W[i, j]
             X = GX[i, j] * w
@@ -201,6 +211,7 @@ def sample_and_project(flat, start, stride, order, px, py, warp, radius, patches
     `sums` receives Σ W G, Σ G², Σ G F of G minus `sums[0]` (a value near the mean); `b` receives Σ G ∇F of the same.
     """
     n = 2 * radius + 1
+    wide = padded(n)
     F, GX, GY, W = patches[0], patches[1], patches[2], patches[3]
     ix0 = math.floor(px)
     iy0 = math.floor(py)
@@ -222,8 +233,8 @@ def sample_and_project(flat, start, stride, order, px, py, warp, radius, patches
         bx = x0 + a12 * yl
         by = y0 + a22 * yl
         if order == 3:
-            for j in range(n):
-                xl = _F4(j - radius)
+            for j in range(wide):
+                xl = _F4(min(j, n - 1) - radius)
                 X = bx + a11 * xl
                 Y = by + a21 * xl
                 ix = np.int32(X)
@@ -232,20 +243,20 @@ def sample_and_project(flat, start, stride, order, px, py, warp, radius, patches
                 cubic_weights(X - _F4(ix), wx, j)
                 cubic_weights(Y - _F4(iy), wy, j)
             for j in range(n):
+                # Column sums first: the taps of a row lie side by side in memory
                 q = index[j]
-                acc = _ZERO
+                c0 = c1 = c2 = c3 = _ZERO
                 for k in range(4):
-                    acc += wy[k, j] * (
-                        wx[0, j] * flat[q]
-                        + wx[1, j] * flat[q + _U1]
-                        + wx[2, j] * flat[q + _U2]
-                        + wx[3, j] * flat[q + _U3]
-                    )
+                    w = wy[k, j]
+                    c0 += w * flat[q]
+                    c1 += w * flat[q + _U1]
+                    c2 += w * flat[q + _U2]
+                    c3 += w * flat[q + _U3]
                     q += step
-                G[i, j] = acc
+                G[i, j] = wx[0, j] * c0 + wx[1, j] * c1 + wx[2, j] * c2 + wx[3, j] * c3
         else:
-            for j in range(n):
-                xl = _F4(j - radius)
+            for j in range(wide):
+                xl = _F4(min(j, n - 1) - radius)
                 X = bx + a11 * xl
                 Y = by + a21 * xl
                 ix = np.int32(X)
@@ -255,20 +266,20 @@ def sample_and_project(flat, start, stride, order, px, py, warp, radius, patches
                 quintic_weights(Y - _F4(iy), wy, j)
             for j in range(n):
                 q = index[j]
-                acc = _ZERO
+                c0 = c1 = c2 = c3 = c4 = c5 = _ZERO
                 for k in range(6):
-                    acc += wy[k, j] * (
-                        wx[0, j] * flat[q]
-                        + wx[1, j] * flat[q + _U1]
-                        + wx[2, j] * flat[q + _U2]
-                        + wx[3, j] * flat[q + _U3]
-                        + wx[4, j] * flat[q + _U4]
-                        + wx[5, j] * flat[q + _U5]
-                    )
+                    w = wy[k, j]
+                    c0 += w * flat[q]
+                    c1 += w * flat[q + _U1]
+                    c2 += w * flat[q + _U2]
+                    c3 += w * flat[q + _U3]
+                    c4 += w * flat[q + _U4]
+                    c5 += w * flat[q + _U5]
                     q += step
-                G[i, j] = acc
+                row = wx[0, j] * c0 + wx[1, j] * c1 + wx[2, j] * c2
+                G[i, j] = row + wx[3, j] * c3 + wx[4, j] * c4 + wx[5, j] * c5
         s0 = s1 = s2 = e0 = e1 = e2 = e3 = _ZERO
-        for j in range(n):
+        for j in range(wide):
             xl = _F4(j - radius)
             g = (G[i, j] - centre) * W[i, j]
             s0 += g

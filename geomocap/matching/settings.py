@@ -31,11 +31,11 @@ class SeedSettings(Settings):
     window: int = Field(7, ge=3, le=31, description="window of the interest operator, odd (px)")
     minimum_weight: float = Field(0.1, ge=0, description="least w of an interest point, in means of w")
     minimum_roundness: float = Field(0.3, ge=0, le=1, description="least q of an interest point")
-    cell: int = Field(10, ge=4, description="edge of the cells that have one interest point each (px)")
-    limit: int = Field(800, ge=1, description="most interest points")
+    cell: int = Field(14, ge=4, description="edge of the cells that have one interest point each (px)")
+    limit: int = Field(1000, ge=1, description="most interest points")
     radius: int = Field(8, ge=3, le=40, description="radius of the patches that are correlated (px)")
     blur: float = Field(1.2, ge=0, description="smoothing before the search, standard deviation (px)")
-    step: float = Field(1.5, gt=0.1, description="step along the epipolar line (px)")
+    step: float = Field(2.0, gt=0.1, description="step along the epipolar line (px)")
     tilt: float = Field(0.7, gt=0, description="step of the tangents of the tilts of the planes that are tried")
     tilts: int = Field(2, ge=0, le=4, description="number of such steps each way, in x and in y")
     correlation: float = Field(0.5, ge=-1, le=1, description="least correlation in every image")
@@ -47,7 +47,12 @@ class SeedSettings(Settings):
 class GrowingSettings(Settings):
     """How matching spreads from the seeds over the template image."""
 
-    step: float = Field(1.5, gt=0.25, description="distance of neighbouring points in the template image (px)")
+    step: float | None = Field(
+        None,
+        gt=0.25,
+        description="distance of neighbouring points in the template image; 1.5, and 2 with several templates, "
+        "if not given (px)",
+    )
     order: Literal["best", "paper"] = Field(
         "best", description="best: best neighbour first; paper: sequential horizontal and vertical shifts"
     )
@@ -63,11 +68,10 @@ class GrowingSettings(Settings):
     maximum_epipolar: float = Field(0.7, gt=0, description="greatest distance from the epipolar line (px)")
     attempts: int = Field(3, ge=1, le=8, description="neighbours from which a point is tried")
     hole_passes: int = Field(40, ge=0, description="most rounds of filling holes from all directions")
-    tilting: bool = Field(True, description="whether holes are also tried on planes tilted otherwise, as at an edge")
     agreement: float = Field(0.6, gt=0, description="greatest departure from what a neighbour predicts (px)")
-    minimum_patch: int = Field(40, ge=1, description="least number of points that hang together")
-    minimum_pair_patch: int = Field(
-        400, ge=1, description="the same where no point of the patch was seen by more than one search image of several"
+    minimum_patch: float = Field(90.0, ge=0, description="least area of points that hang together (px²)")
+    minimum_pair_patch: float = Field(
+        900.0, ge=0, description="the same where no point was seen by more than one search image of several (px²)"
     )
     confirmed: float = Field(
         0.02, ge=0, le=1, description="share of a patch seen by several search images that makes it more than a pair's"

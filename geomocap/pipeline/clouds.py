@@ -1,15 +1,18 @@
-"""Stage: images → measured surface points, `cloud/000000.ply` and beside it why matches failed, `cloud/000000.json`."""
+"""Stage: images → measured surface points `cloud/000000.ply`, and how they came about, `cloud/000000.json`."""
 
 from __future__ import annotations
 
 import json
+import re
+from collections import Counter
 from dataclasses import dataclass
+from typing import Literal
 
 import open3d as o3d
 
 from geomocap.capture import Capture, read_image
-from geomocap.cloud import CloudSettings, MatchGroups, cloud_of_frame, match_groups
-from geomocap.errors import CaptureError, GeometryError
+from geomocap.cloud import CloudFrame, CloudSettings, MatchGroups, cloud_of_frame, match_groups
+from geomocap.errors import CaptureError, GeometryError, RunError
 from geomocap.files import write_atomic, write_text
 from geomocap.geometry import Voxels
 from geomocap.pipeline.job import Job
@@ -19,31 +22,52 @@ from geomocap.run import Run, stage_key
 from geomocap.scheduling import map_items
 
 HULL_CAMERAS = 4  # fewer cameras don't enclose the subject: their hull bounds nothing
+BACKGROUND_FRAMES = 10  # fewer frames without a background picture don't show what moves
+
+Bounds = Literal["hull", "silhouettes", "none"]
 
 
 def clouds(job: Job) -> str:
-    """Measure the surface in all frames, silhouettes and hull first if need be, and return the stage's key."""
+    """Measure the surface in all frames, silhouettes and hull first where there are any; return the stage's key."""
     capture = job.capture
     if capture is None:
         raise CaptureError("clouds need a capture")
-    settings = job.config.cloud
-    if capture.info.template_camera is not None and settings.groups.template_camera is None:
-        named = settings.groups.model_copy(update={"template_camera": capture.info.template_camera})
-        settings = settings.model_copy(update={"groups": named})
+    settings = cloud_settings(job.config.cloud, capture)
     groups = match_groups(capture.rig, settings.groups)
-    with_hull = len(capture.rig) >= HULL_CAMERAS
-    bounds = voxels(job) if with_hull else silhouettes(job)
+    bounds = bounds_of(capture, settings)
+    before = {"hull": voxels, "silhouettes": silhouettes, "none": lambda _: ""}[bounds](job)
     pictures = capture.fingerprint("images", "videos", "sparse")
-    key = stage_key("cloud", bounds, pictures, settings.model_dump())
+    key = stage_key("cloud", bounds, before, pictures, settings.model_dump(), capture.info.region_of_interest)
 
     def work() -> int:
-        task = _Measure(capture, job.run, settings, groups, with_hull)
+        task = _Measure(capture, job.run, settings, groups, bounds)
         missing = [k for k in range(capture.n_frames) if not job.run.frame_file("cloud", k).exists()]
         for _ in map_items(task, missing, job.executor, "cloud", job.progress, 4):
             pass
         return len(missing)
 
     return job.stage("cloud", key, ["cloud"], work)
+
+
+def cloud_settings(settings: CloudSettings, capture: Capture) -> CloudSettings:
+    """Return the settings, with the capture's template camera if none is set."""
+    if capture.info.template_camera is not None and settings.groups.template_camera is None:
+        named = settings.groups.model_copy(update={"template_camera": capture.info.template_camera})
+        return settings.model_copy(update={"groups": named})
+    return settings
+
+
+def bounds_of(capture: Capture, settings: CloudSettings) -> Bounds:
+    """Say what bounds the search: as set, else the most that the capture allows.
+
+    Silhouettes need masks, background pictures of all cameras, or so many frames that what moves stands out.
+    """
+    if settings.bounds != "auto":
+        return settings.bounds
+    plates = all(capture.has_background(c) for c in capture.cameras)
+    if not (capture.has_masks or plates or capture.n_frames >= BACKGROUND_FRAMES):
+        return "none"
+    return "hull" if len(capture.cameras) >= HULL_CAMERAS else "silhouettes"
 
 
 @dataclass(frozen=True)
@@ -54,17 +78,82 @@ class _Measure:
     run: Run
     settings: CloudSettings
     groups: MatchGroups
-    with_hull: bool
+    bounds: Bounds
 
     def __call__(self, frame: int) -> None:
-        cameras = self.capture.cameras
-        images = [self.capture.frame(c, frame) for c in cameras]
-        masks = [read_image(self.run.silhouette_file(c, frame), gray=True) for c in cameras]
-        hull = Voxels.read(self.run.frame_file("voxels", frame)) if self.with_hull else None
-        found = cloud_of_frame(images, masks, hull, self.capture.rig, self.groups, self.settings)
-        write_text(self.run.path / "cloud" / f"{frame:06d}.json", json.dumps(found.reasons, indent=1))
+        found = self.measure(frame)
+        record = {"points": len(found.points), "reasons": found.reasons, "warnings": found.warnings}
+        write_text(self.run.path / "cloud" / f"{frame:06d}.json", json.dumps(record, indent=1))
         if not len(found.points):
-            why = ", ".join(f"{reason}: {count}" for reason, count in found.reasons.items())
+            why = "; ".join(found.warnings) or ", ".join(f"{reason}: {n}" for reason, n in found.reasons.items())
             raise GeometryError(f"frame {frame}: no surface point could be matched ({why}); is there texture in focus?")
         cloud = found.cloud
         write_atomic(self.run.frame_file("cloud", frame), lambda p: o3d.t.io.write_point_cloud(p, cloud))
+
+    def measure(self, frame: int) -> CloudFrame:
+        """Measure one frame without writing anything."""
+        cameras = self.capture.cameras
+        images = [self.capture.frame(c, frame) for c in cameras]
+        masks = hull = None
+        if self.bounds != "none":
+            masks = [read_image(self.run.silhouette_file(c, frame), gray=True) for c in cameras]
+        if self.bounds == "hull":
+            hull = Voxels.read(self.run.frame_file("voxels", frame))
+        box = self.capture.info.region_of_interest
+        return cloud_of_frame(images, masks, hull, self.capture.rig, self.groups, self.settings, box)
+
+
+@dataclass(frozen=True)
+class CloudRecord:
+    """What a run says of its clouds.
+
+    Attributes
+    ----------
+    frames : int
+    points : int
+        Of all frames.
+    reasons : dict
+        What became of all cells and seeds, in words, summed over the frames.
+    warnings : dict
+        Warnings, and the number of frames that have them or the same with other figures.
+    """
+
+    frames: int
+    points: int
+    reasons: dict[str, int]
+    warnings: dict[str, int]
+
+
+def read_cloud_record(run: Run) -> CloudRecord | None:
+    """Sum up `cloud/*.json` of a run; None if there are none.
+
+    Raises
+    ------
+    RunError
+        If a file is damaged.
+    """
+    reasons, warnings = Counter[str](), Counter[str]()
+    first: dict[str, str] = {}
+    files = sorted((run.path / "cloud").glob("[0-9]*.json"))
+    points = 0
+    for file in files:
+        try:
+            record = json.loads(file.read_text(encoding="utf-8"))
+            points += int(record["points"])
+            reasons.update({str(k): int(v) for k, v in record["reasons"].items()})
+            for warning in record["warnings"]:
+                warnings[first.setdefault(re.sub(r"[\d.]+ ?(px|%)", "", warning), warning)] += 1
+        except (OSError, ValueError, KeyError, AttributeError, TypeError):
+            raise RunError(f"{file}: damaged; delete it and run again") from None
+    return CloudRecord(len(files), points, dict(reasons), dict(warnings)) if files else None
+
+
+def measure_again(run: Run, capture: Capture, settings: CloudSettings, frame: int) -> tuple[CloudFrame, MatchGroups]:
+    """Measure one frame of a run once more, for what its files don't hold: regions, shifts, seeds.
+
+    The settings are those of the run; silhouettes and hull are taken from it.
+    """
+    settings = cloud_settings(settings, capture)
+    groups = match_groups(capture.rig, settings.groups)
+    bounds = bounds_of(capture, settings)
+    return _Measure(capture, run, settings, groups, bounds).measure(frame), groups
