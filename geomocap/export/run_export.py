@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geomocap.articulation.model import MODEL_FILE, read_model
 from geomocap.errors import RunError
 from geomocap.export.bvh import write_bvh
 from geomocap.export.c3d import write_c3d
@@ -15,6 +16,7 @@ from geomocap.export.conventions import Axis
 from geomocap.export.errors import MissingPackageError, MotionError
 from geomocap.export.gltf import write_glb
 from geomocap.export.markers import Markers, markers_from_run
+from geomocap.export.model_skin import skin_from_model
 from geomocap.export.motion import Motion
 from geomocap.export.names import Names
 from geomocap.export.settings import ExportSettings
@@ -102,7 +104,7 @@ def export_run(
         skeleton, up=up, names=names, joints=settings.joints, source=str(run.path / "skeleton.npz")
     )
     markers = run_markers(run, skeleton, names, up, ellipsoids=settings.ellipsoids)
-    mesh = skin_from_run(run, motion, settings) if settings.surface == "skin" else None
+    mesh = surface_of_run(run, motion, settings)
     writers = _writers(motion, markers, mesh, settings)
     files, skipped = {}, {}
     chosen = list(formats) if formats is not None else list(FILES)
@@ -139,6 +141,15 @@ def run_markers(
     keypoints = run.read_npz("keypoints.npz") if (run.path / "keypoints.npz").is_file() else None
     shells = run.read_npz("ellipsoids.npz") if ellipsoids and (run.path / "ellipsoids.npz").is_file() else None
     return markers_from_run(skeleton, ellipsoids=shells, keypoints=keypoints, names=names, up=up)
+
+
+def surface_of_run(run: Run, motion: Motion, settings: ExportSettings) -> SkinnedMesh | None:
+    """Return the surface that GLB and USD show: the model's if there is one, else that of a frame; None: bones."""
+    if settings.surface == "bones":
+        return None
+    if (run.path / MODEL_FILE).is_file() and settings.skin_frame == 0:
+        return skin_from_model(read_model(run.path / MODEL_FILE), motion, settings)
+    return skin_from_run(run, motion, settings) if settings.surface == "skin" else None
 
 
 def _writers(

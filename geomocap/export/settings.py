@@ -20,10 +20,14 @@ class ExportSettings(Settings):
     bvh_unit: Literal["m", "cm"] = Field("m", description="unit of BVH files, which can't say it themselves")
     trc_unit: Literal["mm", "m"] = Field("mm", description="unit of TRC files, stated in their header")
     ellipsoids: bool = Field(True, description="whether the ellipsoids' centres are markers, too")
-    surface: Literal["bones", "skin"] = Field(
-        "bones", description="what GLB and USD show: a bone for each body, or the subject's own surface"
+    surface: Literal["auto", "bones", "skin"] = Field(
+        "auto",
+        description="what GLB and USD show: a bone for each body, or the subject's own surface; auto: the surface "
+        "where the run has the subject's model",
     )
-    skin_frame: int = Field(0, ge=0, description="reference frame whose surface is taken")
+    skin_frame: int = Field(
+        0, ge=0, description="reference frame whose surface is taken; a subject's model is used for frame 0"
+    )
     skin_colors: Literal["body", "true"] = Field(
         "body", description="colour the surface by body, or by its own colours"
     )

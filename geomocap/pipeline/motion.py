@@ -9,6 +9,7 @@ import numpy as np
 from geomocap.articulation.refinement import refine_skeleton
 from geomocap.geometry import BodyPoints, Geometry
 from geomocap.pipeline.job import Job
+from geomocap.pipeline.model import make_model
 from geomocap.run import Run
 from geomocap.scheduling import map_items
 from geomocap.segmentation.ellipsoids import Ellipsoids, fit_ellipsoids
@@ -45,6 +46,7 @@ def segment_by_motion(job: Job, geometry: Geometry) -> int:
     }
     job.run.write_npz("ellipsoids.npz", **together, body=np.arange(bodies.body_count, dtype=np.int32))
     job.run.write_npz("skeleton.npz", **found.skeleton.arrays())
+    make_model(job, geometry, found, bodies)
     job.run.write_npz(
         "diagnostics.npz",
         paths=np.array(source),

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from geomocap.articulation.model import MODEL_FILE
 from geomocap.geometry import BodyPoints, Geometry
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.motion import segment_by_motion
 from geomocap.pipeline.sources import Source, geometry_of
 from geomocap.pipeline.tracks import tracks
+from geomocap.pipeline.warnings import WARNINGS_FILE
 from geomocap.run import Run, stage_key
 from geomocap.scheduling import map_items
 from geomocap.segmentation.m3 import segment_m3
@@ -36,9 +38,8 @@ def segment(job: Job, source: Source) -> str:
     if len(geometry) == 1:  # a single frame has no motion to tell bodies and joints by
         outputs.remove("skeleton.npz")
     key = stage_key("segmentation", source_key, settings, job.fps)
-    return job.stage(
-        "segmentation", key, outputs, lambda: (segment_by_motion if by_motion else segment_as_m3)(job, geometry)
-    )
+    work = segment_by_motion if by_motion else segment_as_m3
+    return job.stage("segmentation", key, outputs, lambda: work(job, geometry), [MODEL_FILE, WARNINGS_FILE])
 
 
 def segment_as_m3(job: Job, geometry: Geometry) -> int:

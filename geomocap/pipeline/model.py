@@ -1,0 +1,35 @@
+"""The subject's own model, made from a take: `model.npz`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geomocap.articulation.model import MODEL_FILE, SubjectModel
+from geomocap.articulation.model_building import BodyCloud, build_model
+from geomocap.articulation.refinement import linkage_of
+from geomocap.errors import GeometryError
+from geomocap.geometry import BodyPoints, Geometry
+from geomocap.pipeline.job import Job
+from geomocap.pipeline.warnings import write_warnings
+from geomocap.segmentation.motion_bodies import MotionBodies
+from geomocap.skeleton.motion_skeleton import MotionSkeleton
+
+
+def make_model(job: Job, geometry: Geometry, found: MotionSkeleton, bodies: MotionBodies) -> SubjectModel | None:
+    """Make and write the model of a run whose points have their bodies; None, with a warning, if it can't be made."""
+
+    def read(frame: int) -> BodyCloud:
+        labelled = BodyPoints.read(job.run.frame_file("bodies", frame))
+        colors = geometry.features(frame) if geometry.features is not None else None
+        return BodyCloud(labelled.positions, labelled.body, colors)
+
+    linkage, _ = linkage_of(found, job.config.refinement.hinge_slack_deg)
+    try:
+        with job.run.timed("model") as count:
+            model = build_model(found, bodies, np.asarray(linkage.hinge), read, geometry.spacing)
+            count["items"] = len(model.points)
+    except GeometryError as error:
+        write_warnings(job.run, [str(error)])
+        return None
+    job.run.write_npz(MODEL_FILE, **model.arrays())
+    return model
