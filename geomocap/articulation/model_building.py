@@ -134,8 +134,8 @@ def _agreed_surface(
         parts.append(
             (middle[agreed], mean_normal[agreed] / length[agreed, None], mean_tint[agreed], np.full(agreed.sum(), b))
         )
-    points, directions, tints, body = (np.concatenate([p[i] for p in parts]) for i in range(4))
-    colors = np.rint(255 * tints).astype(np.uint8) if clouds[0].colors is not None else np.zeros((0, 3), np.uint8)
+    points, directions, colored, body = (np.concatenate([p[i] for p in parts]) for i in range(4))
+    colors = np.rint(255 * colored).astype(np.uint8) if clouds[0].colors is not None else np.zeros((0, 3), np.uint8)
     return points, directions, colors, body.astype(int)
 
 
