@@ -14,8 +14,10 @@ from geomocap.tracking.node_graph import NodeGraph
 from geomocap.tracking.node_settings import NodeTrackingSettings
 
 # Distance at which correspondences lose their weight (node spacings) and stiffness, step by step.
-NEAR = ((0.8, 8.0), (0.8, 4.0), (0.6, 4.0), (0.6, 2.0), (0.4, 2.0), (0.4, 1.0), (0.3, 1.0))
-FAR = ((2.0, 8.0), (1.5, 8.0), (1.2, 4.0), (0.8, 4.0), (0.6, 4.0), (0.6, 2.0), (0.4, 2.0), (0.4, 1.0), (0.3, 1.0))
+_SETTLE = ((0.8, 2.0), (0.8, 1.0), (0.8, 1.0), (0.6, 1.0), (0.6, 1.0), (0.6, 1.0), (0.4, 1.0), (0.4, 1.0), (0.3, 1.0))
+NEAR = ((0.8, 8.0), (0.8, 4.0), *_SETTLE)
+FAR = ((2.0, 8.0), (1.5, 8.0), (1.2, 4.0), *_SETTLE)
+_BAD = 1.3  # cost from which a frame is tried again, relative to the median
 
 
 @dataclass(frozen=True)
@@ -87,18 +89,21 @@ class CoarseModel:
     def next_state(self, frame: CoarseTarget, last: State, before: State | None) -> State:
         """Find the nodes in the next frame: from where they are expected and from where they were, near and far."""
         starts = [last] if before is None else [self.expected(last, before), last]
+        frame = self.sided(frame, starts[0])
         found = []
         for start in starts:
             found.append(self.fit(frame, start, NEAR, False))
             found.append(self.fit(frame, start, FAR, True))
         best = min(found, key=lambda s: self.cost(s, starts[0]))
-        # where the frame's normals contradict the surface that was found, they may be on the wrong side
-        y, normals = self.graph.deform(best.x, best.R)
-        points = frame.target.points.turned_like(y, normals, 0.5 * self.graph.spacing)
-        if np.array_equal(points.normals, frame.target.points.normals):
+        turned = self.sided(frame, best)
+        if np.array_equal(turned.target.points.normals, frame.target.points.normals):
             return best
-        turned = replace(frame, target=replace(frame.target, points=points))
         return min(best, self.fit(turned, best, NEAR, False), key=lambda s: s.cost)
+
+    def sided(self, frame: CoarseTarget, state: State) -> CoarseTarget:
+        """Turn the frame's normals to the side that the surface has in a state."""
+        points = frame.target.points.turned_like(*self.graph.deform(state.x, state.R), 0.5 * self.graph.spacing)
+        return replace(frame, target=replace(frame.target, points=points))
 
     def cost(self, state: State, expected: State) -> float:
         """Cost of a state, and of being elsewhere than expected: limbs that seem to have changed places have not."""
@@ -198,8 +203,9 @@ def mend(model: CoarseModel, frames: list[CoarseTarget], states: list[State], re
     usual = float(np.median([model.cost(s, b) for s, b in zip(states[1:-1], between, strict=True)]))
     for t in range(1, T - 1) if way > 0 else range(T - 2, 0, -1):
         middle = model.between(states[t - 1], states[t + 1])
-        if t == reference or model.cost(states[t], middle) < usual:
+        if t == reference or model.cost(states[t], middle) < _BAD * usual:
             continue
-        tried = [model.fit(frames[t], start, NEAR, False) for start in (middle, states[t + 1], states[t - 1])]
+        frame = model.sided(frames[t], middle)
+        tried = [model.fit(frame, start, NEAR, False) for start in (middle, states[t + 1], states[t - 1])]
         states[t] = min([states[t], *tried], key=lambda s: model.cost(s, middle))
     return states

@@ -18,7 +18,7 @@ class NodeTrackingSettings(Settings):
     )
     neighbours: int = Field(9, ge=4, le=60, description="neighbours that make a point's normal")
     stiffness: float = Field(
-        0.3, gt=0, description="resistance to bending and stretching, relative to the points' pull"
+        0.1, gt=0, description="resistance to bending and stretching, relative to the points' pull"
     )
     fine_stiffness: float = Field(1.5, gt=0, description="the same for the fine graph")
     normal_weight: float = Field(1.0, ge=0, description="weight of normals against positions when points are matched")

@@ -11,6 +11,8 @@ from scipy.spatial import cKDTree
 
 from geomocap.errors import GeometryError
 
+_ROUNDS = 10  # in which votes on the side of normals spread to neighbours
+
 
 @dataclass(frozen=True)
 class PointSet:
@@ -25,27 +27,25 @@ class PointSet:
         What else is known of each point, such as its colour; F may be 0.
     gradients : (M, F, 3) float
         How the features change along the surface, per metre.
-    piece : (M,) int
-        Pieces of the surface within which the normals' side is sure; it is a guess how they stand to each other.
     """
 
     positions: np.ndarray
     normals: np.ndarray
     features: np.ndarray
     gradients: np.ndarray
-    piece: np.ndarray
 
     def __len__(self) -> int:
         return len(self.positions)
 
     def at(self, kept: np.ndarray) -> PointSet:
         """Return the points at some indices."""
-        return PointSet(
-            self.positions[kept], self.normals[kept], self.features[kept], self.gradients[kept], self.piece[kept]
-        )
+        return PointSet(self.positions[kept], self.normals[kept], self.features[kept], self.gradients[kept])
 
     def turned_like(self, surface: np.ndarray, normals: np.ndarray, scale: float) -> PointSet:
-        """Turn the normals of whole pieces to the side that a known surface near them has.
+        """Turn normals to the side that a known surface near them has.
+
+        Each point is voted on by the sample next to it; votes then spread to neighbours whose normals are parallel, so
+        that what is far from the known surface follows what is near, and faces that meet at an edge decide alone.
 
         Parameters
         ----------
@@ -54,11 +54,17 @@ class PointSet:
         scale : float
             Distance at which a sample loses its vote, metres.
         """
-        distance, near = cKDTree(surface).query(self.positions)
-        vote = np.exp(-0.5 * (distance / scale) ** 2)
-        agree = np.bincount(self.piece, vote * (self.normals * normals[near]).sum(axis=1))
-        against = agree < -0.2 * np.bincount(self.piece, vote)
-        return replace(self, normals=np.where(against[self.piece, None], -self.normals, self.normals))
+        distance, nearest = cKDTree(surface).query(self.positions)
+        own = np.exp(-0.5 * (distance / scale) ** 2) * (self.normals * normals[nearest]).sum(axis=1)
+        i, j = _pairs(self.positions, min(8, len(self) - 1))
+        cosine = (self.normals[i] * self.normals[j]).sum(axis=1)
+        parallel = csr_matrix((np.where(np.abs(cosine) > 0.6, cosine, 0.0), (i, j)), (len(self), len(self)))
+        parallel = parallel + parallel.T
+        total = np.maximum(np.asarray(np.abs(parallel).sum(axis=1)).ravel(), 1e-9)
+        vote = own
+        for _ in range(_ROUNDS):
+            vote = own + 0.95 * (parallel @ vote) / total
+        return replace(self, normals=np.where((vote < 0)[:, None], -self.normals, self.normals))
 
     def thinned(self, count: int, seed: int) -> PointSet:
         """Return at most `count` points, drawn at random."""
@@ -96,12 +102,12 @@ def point_set(
         chosen = np.sort(np.random.default_rng(seed).permutation(len(points))[: 3 * n_points])
         points, features = points[chosen], features[chosen]
     near = cKDTree(points).query(points, neighbours + 1)[1]
-    normals, piece = oriented_normals(points, near)
+    normals = oriented_normals(points, near)
     gradients = feature_gradients(points, normals, near, features)
-    return PointSet(points, normals, np.asarray(features, float), gradients, piece).thinned(n_points, seed)
+    return PointSet(points, normals, np.asarray(features, float), gradients).thinned(n_points, seed)
 
 
-def oriented_normals(points: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def oriented_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:
     """Normals by principal components, oriented along a minimum spanning tree and then outwards.
 
     Source: H. Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992, sections 3.2 and 3.3.
@@ -114,9 +120,7 @@ def oriented_normals(points: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, 
 
     Returns
     -------
-    normals : (M, 3) float
-    piece : (M,) int
-        Parts of the tree between edges over which the surface turns by more than 45°: there the side may be wrong.
+    (M, 3) float
     """
     local = points[near] - points[near].mean(axis=1, keepdims=True)
     normals = np.linalg.eigh(np.einsum("mki,mkj->mij", local, local))[1][:, :, 0]
@@ -134,10 +138,7 @@ def oriented_normals(points: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, 
         outward = ((points[members] - points[members].mean(axis=0)) * normals[members]).sum()
         if outward < 0:
             normals[members] *= -1
-    sure = tree.copy()
-    sure.data[sure.data > 1 - np.sqrt(0.5)] = 0
-    sure.eliminate_zeros()
-    return normals, connected_components(sure, directed=False)[1]
+    return normals
 
 
 def _follow(normals: np.ndarray, order: np.ndarray, parent: np.ndarray) -> None:
@@ -178,3 +179,9 @@ def surface_graph(points: np.ndarray, normals: np.ndarray, neighbours: int) -> c
     keep = (d < reach) & ((normals[i] * normals[j]).sum(axis=1) > -0.2)
     graph = coo_matrix((np.maximum(d[keep], 1e-9), (i[keep], j[keep])), (M, M)).tocsr()
     return graph.maximum(graph.T)
+
+
+def _pairs(points: np.ndarray, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of all points and of their nearest neighbours, two (M * neighbours,) arrays."""
+    near = cKDTree(points).query(points, neighbours + 1)[1]
+    return np.repeat(np.arange(len(points)), neighbours), near[:, 1:].ravel()

@@ -18,7 +18,7 @@ from geomocap.tracking.keyframes import most_open, openness
 from geomocap.tracking.node_graph import farthest_points, node_graph
 from geomocap.tracking.node_settings import NodeTrackingSettings
 from geomocap.tracking.nodes import track_nodes
-from geomocap.tracking.surface_points import point_set, surface_graph
+from geomocap.tracking.surface_points import PointSet, point_set, surface_graph
 
 SMALL = NodeTrackingSettings(nodes=150, coarse_nodes=60, points=1200, coarse_points=800)
 
@@ -295,3 +295,19 @@ def test_the_same_again_with_other_threads(bending):
 def test_no_frames():
     with pytest.raises(GeometryError, match="without frames"):
         track_nodes(lambda t: np.zeros((0, 3)), 0)
+
+
+def test_each_face_of_a_box_is_turned_by_itself():
+    # two faces of a long box with their normals inwards, the others outwards
+    rng = np.random.default_rng(3)
+    p = rng.uniform(-1, 1, (3000, 3)) * [0.5, 0.1, 0.1]
+    axis = rng.integers(1, 3, 3000)
+    side = rng.choice([-1.0, 1.0], 3000)
+    p[np.arange(3000), axis] = 0.1 * side
+    outward = np.zeros((3000, 3))
+    outward[np.arange(3000), axis] = side
+    given = np.where((side > 0)[:, None], -outward, outward)
+    s = PointSet(p, given, np.zeros((3000, 0)), np.zeros((3000, 0, 3)))
+    known = p[:300] + 0.02
+    turned = s.turned_like(known, outward[:300], 0.08).normals
+    assert ((turned * outward).sum(axis=1) > 0).mean() > 0.98
