@@ -91,6 +91,12 @@ def write_results(run: Run, file: KeyPointFile, paths: KeyPointPaths) -> Followe
     return FollowedKeyPoints(paths, *_write_motion(run, markers))
 
 
+def clear_results(run: Run) -> None:
+    """Delete what `keypoints` wrote, so that nothing stale is left."""
+    for name in ("keypoints.npz", "keypoints.trc", "keypoints.c3d"):
+        (run.path / name).unlink(missing_ok=True)
+
+
 def _write_motion(run: Run, markers: Markers) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     trc, c3d = run.path / "keypoints.trc", run.path / "keypoints.c3d"
     write_trc(trc, markers)
