@@ -10,6 +10,7 @@ from geomocap.articulation.refinement import refine_skeleton
 from geomocap.geometry import BodyPoints, Geometry
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.model import make_model
+from geomocap.pipeline.paths import motion_paths
 from geomocap.run import Run
 from geomocap.scheduling import map_items
 from geomocap.segmentation.ellipsoids import Ellipsoids, fit_ellipsoids
@@ -17,18 +18,12 @@ from geomocap.segmentation.motion_bodies import MotionBodies, find_motion_bodies
 from geomocap.segmentation.motion_labels import label_points
 from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
-from geomocap.tracking.nodes import track_nodes
-from geomocap.tracking.selection import spread_out
-
-SAMPLES = 1500  # motion paths that bodies are found from
-LEAST_SAMPLES = 300  # fewer long trajectories than these don't cover a subject: nodes are tracked instead
-LEAST_COVERAGE = 0.4  # nor do trajectories that are measured, on average, in a smaller share of the frames
 
 
 def segment_by_motion(job: Job, geometry: Geometry) -> int:
     """Find bodies and skeleton from motion paths, write them, and return the number of frames."""
     frames = len(geometry)
-    paths, source = _paths(job, geometry)
+    paths, source = motion_paths(job, geometry)
     job.progress("bodies", 0, 1)
     bodies = find_motion_bodies(paths, job.config.motion_bodies)
     job.progress("bodies", 1, 1)
@@ -62,24 +57,6 @@ def segment_by_motion(job: Job, geometry: Geometry) -> int:
         curve_strengths=np.array([step.strength for step in bodies.curve]),
     )
     return frames
-
-
-def _paths(job: Job, geometry: Geometry) -> tuple[MotionPaths, str]:
-    """Motion paths from the best source that there is."""
-    if (job.run.path / "tracks.npz").exists():
-        tracked = job.run.read_npz("tracks.npz")
-        chosen = spread_out(tracked["positions"], SAMPLES)
-        positions = tracked["positions"][chosen]
-        coverage = float(np.isfinite(positions[:, :, 0]).mean()) if len(chosen) else 0.0
-        if len(chosen) >= LEAST_SAMPLES and coverage >= LEAST_COVERAGE:
-            return MotionPaths(positions, sigma=_filled(tracked["sigma"][chosen])), "patches"
-    nodes = track_nodes(geometry.points, len(geometry), job.config.nodes, geometry.features, job.progress, job.executor)
-    return nodes.motion_paths(), "nodes"
-
-
-def _filled(sigma: np.ndarray) -> np.ndarray:
-    """Standard deviations with the median where a sample was not seen."""
-    return np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma))
 
 
 @dataclass(frozen=True)

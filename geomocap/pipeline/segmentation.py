@@ -26,7 +26,7 @@ def segment(job: Job, source: Source) -> str:
     by_motion = config.segmentation.method == "motion" and len(geometry) > 1
     settings: dict[str, Any] = {"segmentation": config.segmentation.model_dump()}
     if by_motion:
-        if job.capture is not None:
+        if job.capture is not None and config.segmentation.paths != "nodes":
             settings["tracks"] = tracks(job)
         settings |= {
             name: getattr(config, name).model_dump()

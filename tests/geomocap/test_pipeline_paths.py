@@ -1,0 +1,82 @@
+"""Which motion paths the bodies are found from, and robustness of the nodes against what scans bring along."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from geomocap.config import Config
+from geomocap.errors import GeometryError
+from geomocap.pipeline.job import Job
+from geomocap.pipeline.paths import motion_paths
+from geomocap.run import Run
+from geomocap.segmentation.settings import SegmentationSettings
+from geomocap.tracking.node_settings import NodeTrackingSettings
+
+FRAMES = 3
+
+
+@dataclass(frozen=True)
+class Ball:
+    """Points on a ball that moves along x, with a colour."""
+
+    spacing = 0.05
+
+    def __len__(self) -> int:
+        return FRAMES
+
+    def points(self, frame: int) -> np.ndarray:
+        d = np.random.default_rng(frame).normal(size=(1200, 3))
+        return d / np.linalg.norm(d, axis=1, keepdims=True) * [1.0, 0.8, 0.5] + [0.05 * frame, 0, 0]
+
+    def features(self, frame: int) -> np.ndarray:
+        raise AssertionError("colours were not to be asked for")
+
+
+@pytest.fixture
+def job(tmp_path):
+    def make(paths: str, tracks: np.ndarray | None = None) -> Job:
+        config = Config(
+            segmentation=SegmentationSettings(paths=paths),
+            nodes=NodeTrackingSettings(nodes=60, coarse_nodes=40, points=600, coarse_points=400, colors=False),
+        )
+        run = Run(tmp_path / "run")
+        if tracks is not None:
+            run.write_npz("tracks.npz", positions=tracks, sigma=np.full(tracks.shape[:2], 0.002))
+        return Job(run, config, executor)
+
+    with ThreadPoolExecutor(1) as executor:
+        yield make
+
+
+def trajectories(count: int, seen: float) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    tracks = rng.normal(size=(count, 1, 3)) + 0.05 * np.arange(FRAMES)[None, :, None]
+    tracks[rng.random((count, FRAMES)) > seen] = np.nan
+    return tracks
+
+
+def test_nodes_leave_trajectories_and_colours_alone(job):
+    paths, source = motion_paths(job("nodes", trajectories(500, 1.0)), Ball())
+    assert source == "nodes"
+    assert paths.count == 60
+
+
+def test_patches_where_they_cover_the_subject(job):
+    assert motion_paths(job("auto", trajectories(500, 1.0)), Ball())[1] == "patches"
+
+
+def test_nodes_where_there_are_too_few_patches(job):
+    assert motion_paths(job("auto", trajectories(100, 1.0)), Ball())[1] == "nodes"
+
+
+def test_few_patches_where_they_are_asked_for(job):
+    assert motion_paths(job("patches", trajectories(100, 1.0)), Ball())[1] == "patches"
+
+
+def test_patches_that_are_not_there(job):
+    with pytest.raises(GeometryError, match=r"segmentation\.paths = nodes"):
+        motion_paths(job("patches"), Ball())
