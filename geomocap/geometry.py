@@ -168,6 +168,22 @@ def read_cloud(path: Path) -> np.ndarray:
     return cloud.point.positions.numpy().astype(np.float64)
 
 
+def read_cloud_colors(path: Path) -> np.ndarray:
+    """Read the colours of a point cloud file, (N, 3) uint8, in the file's order.
+
+    Raises
+    ------
+    GeometryError
+        If the file is missing or its points have no colours.
+    """
+    if not path.is_file():
+        raise GeometryError(f"{path}: no such point cloud")
+    cloud = o3d.t.io.read_point_cloud(path)
+    if "colors" not in cloud.point:
+        raise GeometryError(f"{path}: its points have no colours; delete it and run again")
+    return cloud.point.colors.numpy()
+
+
 _HEADER = b"""ply
 format binary_little_endian 1.0
 comment Created by Open3D

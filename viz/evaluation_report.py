@@ -15,9 +15,11 @@ from geomocap.evaluation.truth import Truth
 from geomocap.progress import Progress, silent
 from geomocap.run import Run
 from viz.figures import MUTED, plot
+from viz.matching_review import error_sheet, surface_errors
 from viz.palette import ACCENT, body_color, hex_color
-from viz.report import Block, Report, Section, missing, table, text, write_report
+from viz.report import Block, Report, Section, missing, picture, table, text, write_report
 from viz.report import plot as plot_block
+from viz.results import read_points
 
 WORST_CURVES = 8
 KEY_FIGURES = (
@@ -155,7 +157,15 @@ def _pictures(result: Evaluation, run: Path, truth_path: Path) -> list[Block]:
         )
         at = _worst_of(result, "joints: mean distance")
         blocks.append(plot_block(joint_errors(result, skeleton, truth, at), f"Joints in frame {at}, the worst", words))
-    return blocks or [missing("The run holds no bodies and no matched joints.")]
+    clouds = [k for k in opened.frames("cloud") if k < len(truth.vertices)]
+    if clouds:
+        at = clouds[len(clouds) // 2]
+        points = read_points(opened.frame_file("cloud", at)).positions
+        errors = surface_errors(points, truth.vertices[at], truth.faces)
+        words = "Measured points by their signed distance from the true surface: inside it blue, outside red."
+        limit = max(float(np.quantile(np.abs(errors), 0.95)), 1e-4)
+        blocks.append(picture(error_sheet(points, errors, limit), f"The cloud of frame {at}", words))
+    return blocks or [missing("The run holds no clouds, no bodies and no matched joints.")]
 
 
 def worst_frame(result: Evaluation, run: Run) -> int | None:

@@ -8,10 +8,14 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from geomocap.cloud import CloudFrame, TemplateCloud
+from geomocap.cloud import CloudFrame, TemplateCloud, undistorted_color
+from geomocap.config import load_config
+from geomocap.errors import GeomocapError
 from geomocap.matching.growing import SurfaceMatches
+from geomocap.pipeline.clouds import measure_again
 from viz.drawing import faded, sheet, text_width, write_on
 from viz.palette import ACCENT, INK, body_color
+from viz.results import Results
 from viz.views import look
 
 PARTLY = (230, 130, 20)
@@ -25,6 +29,29 @@ UNMATCHED = (176, 178, 182)
 _LOW, _MIDDLE, _HIGH = (34, 94, 168), (250, 240, 180), (178, 24, 43)
 
 
+def measured_frame(results: Results, frame: int) -> tuple[CloudFrame, np.ndarray] | None:
+    """Measure a frame of a run once more, for what its files don't hold: seeds, regions, shifts.
+
+    Returns
+    -------
+    (CloudFrame, (H, W, 3) uint8) or None
+        With the image of the template that gave most points, free of distortion; None if the capture is not at hand
+        or nothing is found.
+    """
+    capture = results.capture
+    if capture is None or not capture.is_calibrated:
+        return None
+    settings = load_config(results.run.path / "run.toml").cloud
+    try:
+        found, groups = measure_again(results.run, capture, settings, frame)
+    except GeomocapError:
+        return None
+    if not len(found.points):
+        return None
+    template = max(found.templates, key=lambda t: len(t.points)).group.template
+    return found, undistorted_color(capture.frame(capture.cameras[template], frame), groups, template)
+
+
 def matched_picture(image: np.ndarray, surface: SurfaceMatches, width: int = 900) -> np.ndarray:
     """Draw the template with its matched points: seen in all search images, in some, removed, and the seeds.
 
@@ -34,7 +61,7 @@ def matched_picture(image: np.ndarray, surface: SurfaceMatches, width: int = 900
         Template image without distortion (`geomocap.cloud.undistorted_color`).
     surface : SurfaceMatches
     width : int
-        Width of the picture, pixels; the picture is cut to the grid.
+        Width of the picture, pixels; the picture is cut to what was matched.
 
     Returns
     -------
@@ -235,10 +262,11 @@ def frame_sheet(
 
 
 def _cut(image: np.ndarray, surface: SurfaceMatches, width: int, fade: float):
-    """Cut the image to the grid, scale and fade it; also return the way from pixels to it, and its scale."""
-    pixels = surface.grid.pixels if len(surface.grid) else np.array([[0.0, 0.0], image.shape[1::-1]])
+    """Cut the image to what was matched, scale and fade it; also return the way from pixels to it, and its scale."""
+    shown = surface.matched if surface.matched.any() else np.ones(len(surface.grid), bool)
+    pixels = surface.grid.pixels[shown] if len(surface.grid) else np.array([[0.0, 0.0], image.shape[1::-1]])
     low = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - 6, 0)
-    high = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 6, image.shape[1::-1])
+    high = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 7, image.shape[1::-1])
     scale = width / (high[0] - low[0])
     part = image[low[1] : high[1], low[0] : high[0]]
     canvas = cv2.resize(part, (width, round(scale * part.shape[0])), interpolation=cv2.INTER_CUBIC)

@@ -11,12 +11,14 @@ import numpy as np
 from geomocap.capture import Capture
 from geomocap.errors import GeometryError, RunError
 from geomocap.files import write_atomic
+from geomocap.pipeline.clouds import read_cloud_record
 from geomocap.progress import Progress, silent
 from geomocap.run import Run
 from viz import figures, separation, sheets
 from viz.drawing import write_png
+from viz.matching_review import frame_sheet, measured_frame, template_sheet
 from viz.quality import Quality, assess, relative_paths
-from viz.report import Block, Report, missing, picture, plot, video, write_report
+from viz.report import Block, Report, missing, picture, plot, table, text, video, write_report
 from viz.results import Results
 from viz.scene import stage as find_stage
 from viz.sections import (
@@ -125,6 +127,7 @@ def review(
         section("What went in", _inputs(results, stage, chosen, desk)),
         section("Silhouettes", _silhouettes(results, quality, chosen, desk)),
         section("Volume and points", _volume(results, stage, chosen, desk)),
+        section("Surface measurement", _clouds(results, chosen, desk)),
         section("Ellipsoids and their paths", _ellipsoids(results, stage, chosen, desk)),
         section("Rigid bodies", _bodies(results, stage, chosen, desk)),
         section("How the bodies were told apart", _separation(results, stage, desk)),
@@ -209,6 +212,34 @@ def _volume(results: Results, stage: Stage | None, frames: list[int], desk: Desk
         words = "Surface voxels or points in each frame. Jumps point to frames with bad silhouettes."
         blocks += desk.plot("counts", figures.counts(numbers), "Numbers", words)
     return blocks
+
+
+def _clouds(results: Results, frames: list[int], desk: Desk) -> list[Block]:
+    record = read_cloud_record(results.run)
+    if record is None:
+        return []
+    blocks: list[Block] = []
+    if record.warnings:
+        blocks.append(Block("warnings", items=tuple(record.warnings)))
+    blocks.append(text("What became of the places where a match was sought, and of the seeds, on average in a frame:"))
+    rows = [(reason, f"{n / record.frames:,.0f}") for reason, n in sorted(record.reasons.items(), key=lambda r: -r[1])]
+    blocks.append(table(("reason", "in a frame"), rows, numbers=(1,)))
+    number = frames[len(frames) // 2]
+    measured = measured_frame(results, number)
+    if measured is None:
+        desk.step()
+        return blocks
+    frame, image = measured
+    words = (
+        "The template that gave most points. Left: points matched in all search images, in some, and those that "
+        "disagreed with their neighbours; rings are the seeds. Middle: the seeds' regions and the shifts along which "
+        "they were covered. Right: the way from the template to the first search image."
+    )
+    best = max(frame.templates, key=lambda t: len(t.points))
+    blocks += desk.sheet("matching", template_sheet(image, best), f"Matching in frame {number}", words)
+    words = "The points from several sides, in their colours; where there are several, by the template they come from."
+    up = np.eye(3)["xyz".index(results.up)]
+    return blocks + desk.sheet("cloud_sides", frame_sheet(frame, up=up), f"The cloud of frame {number}", words)
 
 
 def _ellipsoids(results: Results, stage: Stage | None, frames: list[int], desk: Desk) -> list[Block]:

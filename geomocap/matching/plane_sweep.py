@@ -16,6 +16,8 @@ from numba import njit, prange
 from geomocap.matching.patch_kernel import transfer
 from geomocap.matching.plane_patch import on_plane, refine, template_patch
 
+_PROMISING = 16  # places on a line at which tilted planes are tried, those where facing ones correlate best
+
 
 @dataclass(frozen=True)
 class SweepImages:
@@ -118,10 +120,42 @@ def sweep(
                     break
             if not inside:
                 continue
+            plane[0] = mu
+            plane[1] = plane[2] = 0.0
+            total = on_plane(
+                transfers,
+                shapes,
+                starts,
+                flat,
+                x,
+                y,
+                plane,
+                f,
+                offsets,
+                variance,
+                radius,
+                position,
+                affine,
+                point,
+                each,
+                -1,
+            )
+            scores[m, :images] = each
+            scores[m, images] = total
+        tilt_of[:] = side * side // 2
+        # Tilted planes, where facing ones are not hopeless
+        promise = np.empty(steps)
+        for m in range(steps):
+            promise[m] = scores[m].max()
+        for _ in range(min(steps, _PROMISING)):
+            m = np.argmax(promise)
+            if not promise[m] > -1.5:
+                break
+            promise[m] = -2.0
             for t in range(side * side):
-                plane[0] = mu
-                plane[1] = mu * tilt / focal * (t % side - tilts)
-                plane[2] = mu * tilt / focal * (t // side - tilts)
+                plane[0] = low + (high - low) * (m + 0.5) / steps
+                plane[1] = plane[0] * tilt / focal * (t % side - tilts)
+                plane[2] = plane[0] * tilt / focal * (t // side - tilts)
                 total = on_plane(
                     transfers,
                     shapes,

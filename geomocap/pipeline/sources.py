@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from geomocap.errors import GeometryError
-from geomocap.geometry import Geometry, Voxels, read_cloud
+from geomocap.geometry import Geometry, Voxels, read_cloud, read_cloud_colors
 from geomocap.pipeline.clouds import clouds
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.voxels import voxels
@@ -61,7 +61,9 @@ class CloudFrames:
         """Points of one frame, (N, 3) float, metres, world."""
         return read_cloud(self.run.frame_file("cloud", frame))
 
-    features = None
+    def features(self, frame: int) -> np.ndarray:
+        """Colours of the points, (N, 3) float, 0 to 1."""
+        return read_cloud_colors(self.run.frame_file("cloud", frame)) / 255.0
 
 
 def geometry_of(job: Job, source: Source) -> tuple[Geometry, str]:

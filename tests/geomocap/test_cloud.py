@@ -6,17 +6,28 @@ import cv2
 import numba
 import numpy as np
 import open3d as o3d
+import pycolmap
 import pytest
 from scipy.spatial import cKDTree
 
 from geomocap.cameras import Rig
 from geomocap.cloud import CloudFrame, CloudSettings, cloud_of_frame, match_groups
-from geomocap.cloud.bounds import hull_depth, inside_silhouettes
+from geomocap.cloud.bounds import box_depth, hull_depth, inside_silhouettes
 from geomocap.cloud.groups import scene_center
 from geomocap.cloud.settings import GroupSettings
 from geomocap.errors import CalibrationError, GeometryError
 from geomocap.geometry import Voxels
-from tests.geomocap.ball import RADIUS, Texture, cosines, off_surface, photograph, ring, surface_points
+from tests.geomocap.ball import (
+    HEIGHT,
+    RADIUS,
+    WIDTH,
+    Texture,
+    cosines,
+    off_surface,
+    photograph,
+    ring,
+    surface_points,
+)
 
 SETTINGS = CloudSettings.model_validate({"growing": {"step": 3.0, "radius": 4}})
 TRIPLET = ring(3, 40)
@@ -213,3 +224,106 @@ def test_groups_that_can_t_be() -> None:
         match_groups(ring(2, 180))
     with pytest.raises(CalibrationError, match="camX"):
         match_groups(TRIPLET, GroupSettings(template_camera="camX"))
+
+
+def turned(rig: Rig, camera: int, degrees: float) -> Rig:
+    """The rig as if one camera had been turned, about an oblique axis."""
+    poses = np.array(rig.cam_from_world)
+    axis = np.array([0.6, 0.64, 0.48]) * np.radians(degrees)
+    poses[camera] = cv2.Rodrigues(axis)[0] @ poses[camera]
+    return Rig(rig.names, rig.cameras, poses)
+
+
+@pytest.mark.parametrize("degrees", [1.0, 5.0])
+def test_turned_camera_is_left_out(sharp: CloudFrame, degrees: float) -> None:
+    frame = measure(turned(TRIPLET, 2, degrees), *photograph(TRIPLET, Texture.random()))
+    assert np.sum(off_surface(frame.points.positions) > 0.02) < 0.01 * len(sharp.points)
+    # The other pair still measures
+    assert len(frame.points) > 0.3 * len(sharp.points)
+    assert any("cam2" in w for w in frame.warnings)
+
+
+def test_turned_template_gives_way_to_another(sharp: CloudFrame) -> None:
+    frame = measure(turned(TRIPLET, 1, 1.0), *photograph(TRIPLET, Texture.random()))
+    assert np.sum(off_surface(frame.points.positions) > 0.02) < 0.01 * len(sharp.points)
+    assert any("cam1" in w for w in frame.warnings)
+
+
+def test_mirrored_images_are_not_believed(sharp: CloudFrame) -> None:
+    images, masks = photograph(TRIPLET, Texture.random())
+    frame = measure(TRIPLET, [i[:, ::-1] for i in images], [m[:, ::-1] for m in masks])
+    assert len(frame.points) < 0.01 * len(sharp.points)
+    assert frame.warnings
+
+
+def test_swapped_images_are_not_believed(sharp: CloudFrame) -> None:
+    images, masks = photograph(TRIPLET, Texture.random())
+    frame = measure(TRIPLET, images[::-1], masks[::-1])
+    assert len(frame.points) < 0.01 * len(sharp.points)
+    assert frame.warnings
+
+
+@pytest.mark.parametrize("black", [1, 2])
+def test_one_black_camera_is_named(sharp: CloudFrame, black: int) -> None:
+    images, masks = photograph(TRIPLET, Texture.random())
+    images[black] = 0 * images[black]
+    frame = measure(TRIPLET, images, masks)
+    assert 0.2 * len(sharp.points) < len(frame.points)
+    assert np.mean(off_surface(frame.points.positions) < 5 * 2.0 / 2500) > 0.99
+    assert any(f"cam{black}: nothing matches" in w for w in frame.warnings)
+
+
+def test_highlights_give_no_wrong_points(sharp: CloudFrame) -> None:
+    """A lamp's reflection lies elsewhere on the ball in every image."""
+    images, masks = photograph(TRIPLET, Texture.random())
+    y, x = np.mgrid[: images[0].shape[0], : images[0].shape[1]]
+    for c, image in enumerate(images):
+        spot = 255 * np.exp(-((x - 110 - 30 * c) ** 2 + (y - 90) ** 2) / (2 * 12.0**2))
+        images[c] = np.clip(image + spot[..., None], 0, 255).astype(np.uint8)
+    frame = measure(TRIPLET, images, masks)
+    assert np.sum(off_surface(frame.points.positions) > 0.02) < 0.005 * len(sharp.points)
+    assert len(frame.points) > 0.6 * len(sharp.points)
+
+
+def test_images_of_different_size(sharp: CloudFrame) -> None:
+    images, masks = photograph(TRIPLET, Texture.random())
+    smaller = TRIPLET.cameras[2].todict()
+    half = pycolmap.Camera(smaller)
+    half.rescale(0.5)
+    rig = Rig(TRIPLET.names, (*TRIPLET.cameras[:2], half), TRIPLET.cam_from_world)
+    images[2] = cv2.resize(images[2], (half.width, half.height), interpolation=cv2.INTER_AREA)
+    masks[2] = cv2.resize(masks[2].astype(np.uint8), (half.width, half.height), interpolation=cv2.INTER_NEAREST)
+    frame = measure(rig, images, masks)
+    assert np.mean(off_surface(frame.points.positions) < 5 * 2.0 / 2500) > 0.99
+    assert len(frame.points) > 0.5 * len(sharp.points)
+
+
+@pytest.mark.parametrize("rig", [ring(2, 20), ring(16, 360)], ids=["pair", "ring of 16"])
+def test_without_silhouettes_and_hull(rig: Rig) -> None:
+    images, _ = photograph(rig, Texture.random())
+    settings = CloudSettings.model_validate({"growing": {"step": 5.0, "radius": 4}})
+    box = ((-0.6, -0.6, -0.6), (0.6, 0.6, 0.6))
+    frame = cloud_of_frame(images, None, None, rig, match_groups(rig, settings.groups), settings, box)
+    error = off_surface(frame.points.positions)
+    assert np.mean(error < 5 * 2.0 / 2500) > 0.98
+    points = surface_points()
+    seen = points[np.sort(cosines(rig, points), axis=0)[-2] > 0.6]
+    assert np.mean(cKDTree(frame.points.positions).query(seen)[0] < 6 * PIXEL) > 0.9
+
+
+def test_box_bounds_depths() -> None:
+    entry, leaving = box_depth(TRIPLET, 1, (HEIGHT, WIDTH), ((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)))
+    # The middle ray of the middle camera runs along y, a little up or down
+    assert entry[HEIGHT // 2, WIDTH // 2] == pytest.approx(1.5, abs=0.02)
+    assert leaving[HEIGHT // 2, WIDTH // 2] == pytest.approx(2.5, abs=0.05)
+    assert np.isnan(entry[2, 2])
+    here = box_depth(TRIPLET, 1, (HEIGHT, WIDTH), ((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0)))
+    assert (here[0] < 1e-3).all() and (here[1] > 5).all()
+
+
+def test_spacing_in_metres(sharp: CloudFrame) -> None:
+    settings = SETTINGS.model_copy(update={"spacing": 0.02})
+    frame = measure(TRIPLET, *photograph(TRIPLET, Texture.random()), settings)
+    # Facing the camera, a ball's front is nearer than its middle
+    near = np.median(cKDTree(frame.points.positions).query(frame.points.positions, 2)[0][:, 1])
+    assert 0.013 < near < 0.021

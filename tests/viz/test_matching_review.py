@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import open3d as o3d
 import pytest
 
 from geomocap.cloud import CloudFrame, CloudSettings, cloud_of_frame, match_groups, undistorted_color
+from geomocap.config import load_config
+from geomocap.pipeline import Job, clouds
+from geomocap.run import Run
+from geomocap.scheduling import threads
 from tests.geomocap.ball import RADIUS, Texture, photograph, ring
+from tests.geomocap.test_pipeline_clouds import COARSE, make_capture
 from viz.matching_review import (
     cloud_picture,
     cloud_sheet,
@@ -19,6 +26,7 @@ from viz.matching_review import (
     template_sheet,
 )
 from viz.palette import ACCENT
+from viz.review import review
 
 
 @pytest.fixture(scope="module")
@@ -80,3 +88,15 @@ def test_frame_sheet_of_an_empty_and_a_full_cloud(measured) -> None:
     assert frame_sheet(frame, (0, 45)).shape[1] > 600
     empty = CloudFrame(frame.points.select(np.zeros(len(frame.points), bool)), (), {})
     assert frame_sheet(empty, (0,)).ndim == 3
+
+
+def test_the_report_of_a_run_shows_its_matching(tmp_path: Path) -> None:
+    capture, run = make_capture(tmp_path / "capture"), Run(tmp_path / "run")
+    with threads(1) as executor:
+        job = Job(run, load_config(overrides=COARSE), executor, capture=capture, fps=capture.fps)
+        job.write_record()
+        clouds(job)
+    written = {path.name for path in review(run, capture)}
+    assert {"matching.png", "cloud_sides.png", "report.html"} <= written
+    page = (run.path / "review" / "report.html").read_text()
+    assert "Surface measurement" in page and "matched in one search image only" in page
