@@ -62,7 +62,8 @@ def figure_of(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), dpi=140, layout="constrained")
 
 
-def _times(count: int, fps: float | None) -> tuple[np.ndarray, str]:
+def times_axis(count: int, fps: float | None) -> tuple[np.ndarray, str]:
+    """Return the times of frames and what an axis of them is called."""
     return (np.arange(count) / fps, "time (s)") if fps else (np.arange(count), "frame")
 
 
@@ -78,7 +79,7 @@ def joint_angles(skeleton: Skeleton, fps: float | None) -> Figure:
     """Plot each joint's rotation since the first frame: its size, and its parts about the parent's axes."""
     vectors = skeleton.joint_rotations()
     size = np.linalg.norm(vectors, axis=2)
-    times, label = _times(len(vectors), fps)
+    times, label = times_axis(len(vectors), fps)
     count = len(skeleton.joint_names)
     columns = min(4, max(2, count))
     rows = -(-count // columns)
@@ -103,7 +104,7 @@ def joint_angles(skeleton: Skeleton, fps: float | None) -> Figure:
 @plot
 def path_curves(paths: Paths, body: np.ndarray, up: str, fps: float | None) -> Figure:
     """Plot the relative paths' coordinates and the distance curves to the seed, as in the M3 paper's figure 4."""
-    times, label = _times(len(paths.relative), fps)
+    times, label = times_axis(len(paths.relative), fps)
     figure = figure_of(WIDTH, 4.9)
     axes = figure.subplots(2, 2, sharex=True)
     order = [*(d for d in range(3) if "xyz"[d] != up), "xyz".index(up)]
@@ -205,7 +206,7 @@ def bone_lengths(bones: Sequence[Bone], fps: float | None) -> Figure:
     figure = figure_of(WIDTH, 2.5)
     ax = figure.subplots()
     for bone in bones:
-        times, label = _times(len(bone.lengths), fps)
+        times, label = times_axis(len(bone.lengths), fps)
         color = hex_color(body_color(bone.body))
         ax.plot(times, 1000 * (bone.lengths - bone.mean), color=color, lw=1.0)
         ax.set_xlabel(label)

@@ -14,7 +14,7 @@ from geomocap.files import write_atomic
 from geomocap.pipeline.clouds import read_cloud_record
 from geomocap.progress import Progress, silent
 from geomocap.run import Run
-from viz import figures, separation, sheets
+from viz import figures, keypoint_plots, separation, sheets
 from viz.drawing import write_png
 from viz.matching_review import frame_sheet, measured_frame, template_sheet
 from viz.quality import Quality, assess, relative_paths
@@ -118,7 +118,7 @@ def review(
         stage = find_stage(results)
     except GeometryError:
         stage = None
-    desk = Desk(run.path / "review", progress, 21)
+    desk = Desk(run.path / "review", progress, 24)
     progress("review", 0, desk.total)
     quality = assess(results, chosen)
     desk.step()
@@ -132,6 +132,7 @@ def review(
         section("Rigid bodies", _bodies(results, stage, chosen, desk)),
         section("How the bodies were told apart", _separation(results, stage, desk)),
         section("Skeleton and motion", _skeleton(results, stage, quality, chosen, desk)),
+        section("Key-points", _keypoints(results, stage, chosen, desk)),
         section("Quality", figures_of_quality(results, quality)),
         section("Time", _times(results, desk)),
         section("Settings and versions", record_blocks(results)),
@@ -337,6 +338,23 @@ def _skeleton(results: Results, stage: Stage | None, quality: Quality, frames: l
             lengths = figures.bone_lengths(quality.bones, results.fps)
             blocks += desk.plot("bone_lengths", lengths, "Bone lengths", words)
     return blocks
+
+
+def _keypoints(results: Results, stage: Stage | None, frames: list[int], desk: Desk) -> list[Block]:
+    marks = keypoint_plots.read_marks(results)
+    if stage is None or marks is None:
+        return []
+    words = (
+        "Their ways from the front and from the top, with links at some moments; dotted where the body bridges a gap."
+    )
+    blocks = desk.plot("keypoint_paths", keypoint_plots.paths(marks, stage), "Ways of the key-points", words)
+    if (velocities := results.run.read_npz("keypoints.npz").get("velocities")) is not None:
+        words = "A jump where a curve turns dotted, or back, says that the bridge didn't hold."
+        curves = keypoint_plots.speeds(marks, velocities, results.fps)
+        blocks += desk.plot("keypoint_speeds", curves, "Speeds of the key-points", words)
+    words = "Each should stay on the same spot of the subject. Orange: bridged, no trajectory inside in this frame."
+    over = keypoint_plots.overlay_sheet(results, marks, frames)
+    return blocks + desk.sheet("keypoints_overlay", over, "Key-points over the pictures", words)
 
 
 def _times(results: Results, desk: Desk) -> list[Block]:

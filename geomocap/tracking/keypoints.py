@@ -22,8 +22,8 @@ REACH = 4.0
 
 _LEAST = 3  # trajectories inside that a frame needs not to be bridged; those that a turn needs
 _NOISE = 0.001  # m; what a trajectory drifts between frames that its stated precision doesn't know
-_SOFT = 0.15  # standard deviation of skin against a rigid body, share of the distance
-_MEMORY = 3.0  # weight of the largest misfit before in a trajectory's variance
+_SOFT = 0.15  # standard deviation of skin against a rigid body, share of the distance; steeper beyond the radius
+_MEMORY = 12.0  # weight of the largest misfit before in a trajectory's variance
 _ALIKE = 0.003  # m; largest shift within one frame, in the key-point's axes, of a trajectory that joins in
 _LOST = 0.5  # radii; standard deviation from which a key-point counts as lost
 _STEADY = 0.001  # m; how far points may be apart to determine a turn, against the last one
@@ -138,7 +138,8 @@ def _follow(measured: Measured, center: np.ndarray, radius: float, order: range,
                 continue
             a = local[known]
             distance = np.linalg.norm(a, axis=1)
-            variance = measured.variance[t, known] + joined[known] + _MEMORY * misfit[known] + (_SOFT * distance) ** 2
+            soft = (_SOFT * distance) ** 2 * (1 + (distance / radius) ** 2)
+            variance = measured.variance[t, known] + joined[known] + _MEMORY * misfit[known] + soft
             moved, miss = _fit(a, x[known], variance, pose.turn)
             if moved.variance > (_LOST * radius) ** 2:
                 continue
