@@ -43,6 +43,8 @@ class Followed:
         Frames since a patch was last measured.
     reason : (N,) int
         Why it was not measured, see `REASONS`.
+    beside : (N,) int
+        Frames in a row in which an older patch was nearer than patches are placed.
     by_one : bool
         Whether a single camera may follow a patch.
     """
@@ -53,14 +55,16 @@ class Followed:
     spin: np.ndarray
     gap: np.ndarray
     reason: np.ndarray
-    by_one: bool = False
+    beside: np.ndarray
+    by_one: bool
 
     @classmethod
     def begin(cls, patches: Patches, identity: np.ndarray, by_one: bool) -> Followed:
         """Begin with patches at rest."""
         N = len(patches)
         rest = np.zeros((N, 3))
-        return cls(patches, identity, rest, rest.copy(), np.zeros(N, int), np.zeros(N, int), by_one)
+        none = np.zeros(N, int)
+        return cls(patches, identity, rest, rest.copy(), none, none.copy(), none.copy(), by_one)
 
     @property
     def last_reason(self) -> np.ndarray:
@@ -69,7 +73,7 @@ class Followed:
 
     def select(self, which: np.ndarray) -> Followed:
         """Return some of them, by a mask or by positions."""
-        rows = ("identity", "velocity", "spin", "gap", "reason")
+        rows = ("identity", "velocity", "spin", "gap", "reason", "beside")
         return replace(self, patches=self.patches.select(which), **{name: getattr(self, name)[which] for name in rows})
 
     def join(self, other: Followed) -> Followed:
@@ -87,6 +91,7 @@ class Followed:
             np.concatenate([self.spin, spin]),
             np.concatenate([self.gap, other.gap]),
             np.concatenate([self.reason, other.reason]),
+            np.concatenate([self.beside, other.beside]),
             self.by_one,
         )
 
@@ -105,7 +110,7 @@ def search(state: Followed, previous: FrameViews, view: FrameViews, settings: Tr
     unsure = wanted[fit[wanted] < _SURE_START]
     if len(unsure):
         some = patches.positions[unsure]
-        slack = _slack(patches, view, settings.slack_px)
+        slack = hiding_depth(patches, view, settings.slack_px)
         seen = (visible(patches, patches.positions, patches.frames, previous, slack, _FACING) & patches.has)[unsure]
         lifted = onward[0].copy()
         lifted[unsure] = some + lift_flow(previous, some, image_flow(previous, view, some, seen))
@@ -183,7 +188,7 @@ def carry_lost(state: Followed, found: Alignment, good: np.ndarray) -> Alignment
 def new_views(patches: Patches, found: Alignment, good: np.ndarray, view: FrameViews, slack_px: float) -> Patches:
     """Take templates in cameras that have come to see a patch that two others measured well."""
     sure = good & (found.correlation > _NEW_TEMPLATE_CORRELATION) & (found.n_views >= 2)
-    slack = _slack(patches, view, 0.5 * slack_px)
+    slack = hiding_depth(patches, view, 0.5 * slack_px)
     cosine = facings(patches.positions, patches.normals, view)
     want = visible(patches, patches.positions, patches.frames, view, slack, _FACING) & ~patches.has
     want &= (cosine > _NEW_TEMPLATE_FACING) & sure[:, None]
@@ -204,7 +209,7 @@ def _best_start(
     settings: TrackingSettings,
 ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Compare starts on the coarse level; return the best for each patch, and its correlation."""
-    slack = _slack(patches, view, settings.slack_px)
+    slack = hiding_depth(patches, view, settings.slack_px)
     best = np.full(len(patches), -3.0)
     X, Q = starts[0][0].copy(), starts[0][1].copy()
     for positions, frames in starts:
@@ -225,7 +230,7 @@ def _align(
 ) -> Alignment:
     """Align patches with the cameras that see them where they start."""
     patches = state.patches
-    slack = _slack(patches, view, settings.slack_px)
+    slack = hiding_depth(patches, view, settings.slack_px)
     use = visible(patches, *start, view, slack, _FACING) & patches.has
     alone = (use.sum(axis=1) == 1) & state.by_one
     found = align(
@@ -244,6 +249,6 @@ def _align(
     return found.replaced(alone, other)
 
 
-def _slack(patches: Patches, view: FrameViews, slack_px: float) -> np.ndarray:
+def hiding_depth(patches: Patches, view: FrameViews, slack_px: float) -> np.ndarray:
     """Depth by which something must lie before patches to hide them, (N, 1), metres: not a voxel that sticks out."""
     return slack_px * patches.size[:, None] + _SLACK_VOXELS * view.voxel_size

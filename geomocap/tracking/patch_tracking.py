@@ -6,19 +6,25 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads
 from geomocap.tracking.frame_views import FrameViews
-from geomocap.tracking.patch_search import Followed, carry_lost, judge, new_views, search
+from geomocap.tracking.joining import join_broken
+from geomocap.tracking.patch_search import Followed, carry_lost, hiding_depth, judge, new_views, search
 from geomocap.tracking.patches import Patches, with_templates
+from geomocap.tracking.reacquisition import reacquire
 from geomocap.tracking.seeding import seed_for_one_camera, seed_patches, seed_spacing
 from geomocap.tracking.track_record import TrackRecord
 from geomocap.tracking.tracking_settings import TrackingSettings
-from geomocap.tracking.trajectories import LAST_FRAME, Trajectories
+from geomocap.tracking.trajectories import DOUBLE, LAST_FRAME, Trajectories
 
 _SMOOTH = 0.7  # share of the newest motion in the velocity
+_DOUBLE = 0.5  # of the spacing: patches nearer than that follow the same surface
+_LONG_BESIDE = 4  # frames after which the younger one is given up
+_SAME_SIDE = 0.5  # cosine between normals
 
 
 def track_surface(
@@ -31,7 +37,8 @@ def track_surface(
     """Follow the surface of the subject through all frames.
 
     Patches are placed on the first frame's surface and, every `seed_every` frames, wherever the surface has none. All
-    are followed forward; then those placed later backward to the first frame. Frames come in order and two are held.
+    are followed forward; then those placed later backward to the first frame, until they have run for some frames
+    beside an older one, with which they are joined. Frames come in order and two are held.
     Where the cameras are so few that two of them agree on less than a part (`one_camera_below`) of the first frame's
     surface, the rest gets patches of single cameras, whose depth is that of the volume.
 
@@ -65,12 +72,15 @@ def track_surface(
         if state is None:
             spacing = seed_spacing(view, settings.n_patches)
         elif previous is not None:
-            state = _next(state, previous, view, settings, record, k, forward=True)
+            state = _next(state, previous, view, settings, record, k, spacing, forward=True)
         if k % settings.seed_every == 0:
             several, one = _taken(state)
             patches = seed_patches(view, several, spacing, settings, rng)
             if state is None:
                 by_one = len(patches) < settings.one_camera_below * settings.n_patches
+                if len(patches) > settings.n_patches:
+                    spacing *= float(np.sqrt(len(patches) / settings.n_patches))
+                    patches = patches.select(np.sort(rng.choice(len(patches), settings.n_patches, replace=False)))
             if by_one:
                 taken = np.concatenate([several, one, patches.positions])
                 patches = patches.join(seed_for_one_camera(view, taken, spacing, settings, rng))
@@ -87,14 +97,14 @@ def track_surface(
         state = previous = None
         for k, view in _stream(frames, range(last, -1, -1), executor, "track backward", progress):
             if state is not None and previous is not None:
-                state = _next(state, previous, view, settings, record, k, forward=False)
+                state = _next(state, previous, view, settings, record, k, spacing, forward=False)
             if k > 0 and k in seeds:
                 fresh = _dressed(seeds[k], view)
                 state = fresh if state is None else state.join(fresh)
             previous = view
         if state is not None:
             record.ended(state.identity, state.last_reason, forward=False)
-    return record.trajectories(count)
+    return join_broken(record.trajectories(count))
 
 
 def _stream(
@@ -142,6 +152,7 @@ def _next(
     settings: TrackingSettings,
     record: TrackRecord,
     frame: int,
+    spacing: float,
     forward: bool,
 ) -> Followed:
     """Follow patches into the next frame, record what was measured, and let go of those lost for too long."""
@@ -152,11 +163,19 @@ def _next(
     good = reason == LAST_FRAME
     found = carry_lost(state, found, good)
     old = state.patches
+    if frame % settings.seed_every == 0:
+        carried = old.moved(found.positions, found.frames)
+        again, seen, cameras = reacquire(carried, ~good, view, hiding_depth(old, view, settings.slack_px), settings)
+        found, good = found.replaced(seen, again), good | seen
+        old = with_templates(old.moved(found.positions, found.frames), cameras, view).moved(old.positions, old.frames)
     shift = found.positions - old.positions
     turn = Rotation.from_matrix(found.frames @ np.swapaxes(old.frames, 1, 2)).as_rotvec()
     gap = np.where(good, 0, state.gap + 1)
     moved = new_views(old.moved(found.positions, found.frames), found, good, view, settings.slack_px)
     record.measured(frame, state.identity[good], found, np.flatnonzero(good))
+    double = good & np.isin(state.identity, _beside_older(*record.at(frame), _DOUBLE * spacing))
+    beside = np.where(double, state.beside + 1, 0)
+    reason = np.where(beside >= _LONG_BESIDE, DOUBLE, reason)
     state = Followed(
         moved,
         state.identity,
@@ -164,8 +183,18 @@ def _next(
         _SMOOTH * turn + (1 - _SMOOTH) * state.spin,
         gap,
         reason,
+        beside,
         state.by_one,
     )
-    lost = gap > settings.longest_gap
+    lost = (gap > settings.longest_gap) | (reason == DOUBLE)
     record.ended(state.identity[lost], reason[lost], forward)
     return state.select(~lost) if lost.any() else state
+
+
+def _beside_older(identity: np.ndarray, positions: np.ndarray, normals: np.ndarray, distance: float) -> np.ndarray:
+    """Return which of the patches measured in a frame lie beside an older one on the same side of the surface."""
+    if len(identity) < 2:
+        return np.zeros(0, int)
+    first, second = cKDTree(positions).query_pairs(distance, output_type="ndarray").T
+    same = np.einsum("ni,ni->n", normals[first], normals[second]) > _SAME_SIDE
+    return np.unique(np.maximum(identity[first[same]], identity[second[same]]))

@@ -54,6 +54,22 @@ class Alignment:
         """Return it at other places."""
         return replace(self, positions=positions, frames=frames)
 
+    def spread(self, which: np.ndarray, positions: np.ndarray, frames: np.ndarray) -> Alignment:
+        """Return it as rows `which` of an alignment of more patches at given places, the others not found."""
+        N, C = len(positions), self.by_camera.shape[1]
+        rest = Alignment(
+            positions.copy(),
+            frames.copy(),
+            np.full(N, -1.0),
+            np.zeros(N, int),
+            np.full(N, np.inf),
+            np.full(N, np.inf),
+            np.full((N, C), -1.0),
+        )
+        for field in fields(self):
+            getattr(rest, field.name)[which] = getattr(self, field.name)
+        return rest
+
 
 @dataclass(frozen=True)
 class Patches:

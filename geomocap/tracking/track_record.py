@@ -48,6 +48,17 @@ class TrackRecord:
             )
         )
 
+    def at(self, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what has been measured in a frame: identities (A,), positions (A, 3) and normals (A, 3)."""
+        here = [m for m in self._measured if m.frame == frame]
+        if not here:
+            return np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3))
+        return (
+            np.concatenate([m.identity for m in here]),
+            np.concatenate([m.positions for m in here]),
+            np.concatenate([m.frames[:, :, 2] for m in here]),
+        )
+
     def placed(self, frame: int, identity: np.ndarray, patches: Patches) -> None:
         """Keep new patches: their templates fit themselves, to a tenth of a pixel."""
         self._placed.append((frame, identity, patches.frames))

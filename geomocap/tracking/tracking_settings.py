@@ -29,6 +29,6 @@ class TrackingSettings(Settings):
     sigma_px: float = Field(0.2, gt=0, description="Largest standard deviation of a position (pixels on the patch)")
     slack_px: float = Field(8.0, gt=0, description="Depth, beyond two voxels, of what hides a patch (pixels on it)")
     neighbour_px: float = Field(3.0, gt=0, description="Largest distance from where neighbours' motion puts it (px)")
-    longest_gap: int = Field(20, ge=0, description="Frames that a lost patch is carried along by its neighbours")
+    longest_gap: int = Field(60, ge=0, description="Frames that a lost patch is carried along by its neighbours")
     backward: bool = Field(True, description="Follow patches placed in later frames backward as well")
     seed: int = Field(0, ge=0, description="Start of the random numbers")

@@ -20,10 +20,13 @@ REASONS = (
     "unlike the motion around it",
     "too short",
     "outside the silhouettes",
+    "beside an older one",
 )
 """Why a trajectory ends (or begins no earlier), by number."""
 
-LAST_FRAME, UNSEEN, LOW_CORRELATION, LOW_PRECISION, APART, TOO_FAST, TOO_JERKY, UNLIKE, TOO_SHORT, OUTSIDE = range(10)
+LAST_FRAME, UNSEEN, LOW_CORRELATION, LOW_PRECISION, APART, TOO_FAST, TOO_JERKY, UNLIKE, TOO_SHORT, OUTSIDE, DOUBLE = (
+    range(11)
+)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,77 @@
+"""Lost patches found again in cameras that had not seen them before: the old templates must fit in two of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geomocap.tracking.frame_views import FrameViews
+from geomocap.tracking.patches import Alignment, Patches, align, facings, visible
+from geomocap.tracking.tracking_settings import TrackingSettings
+
+_FACING = 0.35
+_SURE = 0.92  # correlation
+_FAR_PX = 5.0  # how far from where its neighbours took it a patch may be found
+
+
+def reacquire(
+    patches: Patches, lost: np.ndarray, view: FrameViews, slack: np.ndarray, settings: TrackingSettings
+) -> tuple[Alignment, np.ndarray, np.ndarray]:
+    """Look for lost patches in all cameras that should see them, with one template for all cameras.
+
+    A patch that has turned away from the cameras that have templates of it comes to be seen by others. It is the same
+    piece of surface if what the camera that faces it best remembers fits there in at least two cameras, as it does for
+    a new patch.
+
+    Parameters
+    ----------
+    patches : Patches
+        Where their neighbours' motion has taken them.
+    lost : (N,) bool
+    view : FrameViews
+    slack : (N, 1) float, metres
+        Depth by which something must lie before a patch to hide it.
+    settings : TrackingSettings
+
+    Returns
+    -------
+    Alignment
+    found : (N,) bool
+    agree : (N, C) bool
+        Cameras in which it was found.
+    """
+    use = visible(patches, patches.positions, patches.frames, view, slack, _FACING)
+    which = np.flatnonzero(lost & (use.sum(axis=1) >= settings.n_views) & patches.has.any(axis=1))
+    some, seen = patches.select(which), use[which]
+    rows, C = np.arange(len(which)), view.count
+    best = np.where(some.has, facings(some.positions, some.normals, view), -2).argmax(axis=1)
+    shared = Patches(
+        some.positions,
+        some.frames,
+        some.shape,
+        some.size,
+        np.ascontiguousarray(np.repeat(some.templates[rows, best][:, None], C, axis=1)),
+        np.ascontiguousarray(np.repeat(some.usable[rows, best][:, None], C, axis=1)),
+        seen,
+        some.hidden,
+    )
+    result = align(
+        shared,
+        rows,
+        some.positions,
+        some.frames,
+        seen,
+        view,
+        iterations=(6, 10),
+        least_correlation=settings.camera_correlation,
+        prior_shift_px=_FAR_PX,
+        prior_turn=0.2,
+    )
+    agree = seen & (result.by_camera >= settings.camera_correlation)
+    fits = (agree.sum(axis=1) >= settings.n_views) & (result.correlation >= _SURE)
+    fits &= (result.sigma < settings.sigma_px * some.size) & view.may_be_subject(result.positions)
+    fits &= np.linalg.norm(result.positions - some.positions, axis=1) < _FAR_PX * some.size
+    N = len(patches)
+    found, cameras = np.zeros(N, bool), np.zeros((N, C), bool)
+    found[which[fits]] = True
+    cameras[which[fits]] = agree[fits]
+    return result.spread(which, patches.positions, patches.frames), found, cameras
