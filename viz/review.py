@@ -14,7 +14,7 @@ from geomocap.files import write_atomic
 from geomocap.pipeline.clouds import read_cloud_record
 from geomocap.progress import Progress, silent
 from geomocap.run import Run
-from viz import figures, keypoint_plots, separation, sheets
+from viz import figures, keypoint_plots, separation, sheets, tracks
 from viz.drawing import write_png
 from viz.matching_review import frame_sheet, measured_frame, template_sheet
 from viz.quality import Quality, assess, relative_paths
@@ -118,7 +118,7 @@ def review(
         stage = find_stage(results)
     except GeometryError:
         stage = None
-    desk = Desk(run.path / "review", progress, 24)
+    desk = Desk(run.path / "review", progress, 27)
     progress("review", 0, desk.total)
     quality = assess(results, chosen)
     desk.step()
@@ -128,6 +128,7 @@ def review(
         section("Silhouettes", _silhouettes(results, quality, chosen, desk)),
         section("Volume and points", _volume(results, stage, chosen, desk)),
         section("Surface measurement", _clouds(results, chosen, desk)),
+        section("Surface points through time", _tracks(results, stage, chosen, desk)),
         section("Ellipsoids and their paths", _ellipsoids(results, stage, chosen, desk)),
         section("Rigid bodies", _bodies(results, stage, chosen, desk)),
         section("How the bodies were told apart", _separation(results, stage, desk)),
@@ -241,6 +242,27 @@ def _clouds(results: Results, frames: list[int], desk: Desk) -> list[Block]:
     words = "The points from several sides, in their colours; where there are several, by the template they come from."
     up = np.eye(3)["xyz".index(results.up)]
     return blocks + desk.sheet("cloud_sides", frame_sheet(frame, up=up), f"The cloud of frame {number}", words)
+
+
+def _tracks(results: Results, stage: Stage | None, frames: list[int], desk: Desk) -> list[Block]:
+    found = None if stage is None else tracks.read_tracks(results)
+    if stage is None or found is None or not len(found.positions):
+        return []
+    words = (
+        "Points of the surface followed in the images, with their way over the last frames. Neighbours should move "
+        "alike, and lines should be smooth."
+    )
+    drawn = tracks.trajectory_sheet(results, stage, found, frames)
+    blocks = desk.sheet("tracks", drawn, "Trajectories by displacement", words)
+    words = "Velocities smoothed over some frames: a vector field on the surface."
+    blocks += desk.sheet("velocities", tracks.velocity_sheet(results, stage, found, frames), "Velocities", words)
+    middle = frames[len(frames) // 2]
+    words = (
+        "Red is what was cut off or removed as too fast, accelerated too much, unlike the motion around it, or too "
+        "short (`--filters.*`)."
+    )
+    over = tracks.filter_sheet(results, stage, found, middle)
+    return blocks + desk.sheet("filters", over, f"Filters off and on, frame {middle}", words)
 
 
 def _ellipsoids(results: Results, stage: Stage | None, frames: list[int], desk: Desk) -> list[Block]:

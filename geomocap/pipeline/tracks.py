@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from geomocap.capture import Capture, read_image
 from geomocap.carving.views import Undistortion
 from geomocap.errors import CaptureError
-from geomocap.geometry import Voxels
+from geomocap.geometry import Voxels, read_cloud
+from geomocap.pipeline.clouds import HULL_CAMERAS, clouds
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.voxels import voxels
 from geomocap.run import Run, stage_key
+from geomocap.scans import point_spacing
 from geomocap.tracking.filters import filter_trajectories
 from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.patch_tracking import track_surface
@@ -20,15 +24,22 @@ from geomocap.tracking.smoothing import smooth_motion
 from geomocap.tracking.tracking_settings import TrackingSettings
 from geomocap.tracking.trajectories import REASONS
 
+_CLOSED = 1.8  # edge of the voxels of a cloud, as a multiple of its spacing: without holes
+
 
 def tracks(job: Job) -> str:
-    """Follow the surface through all frames, voxels first if need be, and return the stage's key."""
+    """Follow the surface through all frames, and return the stage's key.
+
+    The surface is that of the voxels; where cameras are too few for a hull, the measured cloud. It is made first if
+    need be.
+    """
     capture = job.capture
     if capture is None:
         raise CaptureError("tracks need a capture")
     pictures = capture.fingerprint("images", "videos", "sparse")
     settings = {name: getattr(job.config, name).model_dump() for name in ("tracking", "filters", "smoothing")}
-    key = stage_key("tracks", voxels(job), pictures, settings, job.fps)
+    surface = voxels(job) if _has_hull(capture) else clouds(job)
+    key = stage_key("tracks", surface, pictures, settings, job.fps)
     return job.stage("tracks", key, ["tracks.npz"], lambda: _track(job, capture))
 
 
@@ -36,7 +47,8 @@ def _track(job: Job, capture: Capture) -> int:
     read = frame_reader(capture, job.run, job.config.tracking)
     found = track_surface(read, capture.n_frames, job.config.tracking, job.progress, job.executor)
     motion = smooth_motion(found.positions, job.fps, found.sigma, job.config.smoothing)
-    kept = filter_trajectories(found, motion, job.config.filters).trajectories
+    filtered = filter_trajectories(found, motion, job.config.filters)
+    kept = filtered.trajectories
     motion = smooth_motion(kept.positions, job.fps, kept.sigma, job.config.smoothing)
     job.run.write_npz(
         "tracks.npz",
@@ -55,14 +67,28 @@ def _track(job: Job, capture: Capture) -> int:
         begin_reason=kept.begin_reason,
         end_reason=kept.end_reason,
         reasons=list(REASONS),
+        unfiltered=found.positions.astype(np.float32),
+        kept=filtered.kept,
     )
     return capture.n_frames
 
 
 def frame_reader(capture: Capture, run: Run, settings: TrackingSettings) -> Callable[[int], FrameViews]:
     """Return what reads the frames of a run for tracking; the first one tells how far images may be reduced."""
-    read = _ReadFrame(capture, run, settings, Undistortion.of(capture.rig), settings.reduction or 1)
+    spacing = None if _has_hull(capture) else _CLOSED * point_spacing(read_cloud(run.frame_file("cloud", 0)))
+    read = _ReadFrame(capture, run, settings, Undistortion.of(capture.rig), settings.reduction or 1, spacing)
     return read if settings.reduction else replace(read, reduction=image_reduction(read(0), settings))
+
+
+def _has_hull(capture: Capture) -> bool:
+    return len(capture.rig) >= HULL_CAMERAS
+
+
+def surface_voxels(points: np.ndarray, size: float) -> Voxels:
+    """Return the voxels of `size` (m) that hold points (N, 3): a cloud as a surface that hides what is behind it."""
+    origin = points.min(axis=0) if len(points) else np.zeros(3)
+    indices = np.unique(np.floor((points - origin) / size).astype(np.int32), axis=0)
+    return Voxels(indices, np.zeros((len(indices), 3), np.uint8), origin, size)
 
 
 @dataclass(frozen=True)
@@ -74,10 +100,14 @@ class _ReadFrame:
     settings: TrackingSettings
     undistortion: Undistortion
     reduction: int
+    cloud_spacing: float | None
 
     def __call__(self, frame: int) -> FrameViews:
         cameras = self.capture.cameras
         images = self.undistortion.images([self.capture.frame(c, frame) for c in cameras])
         masks = [read_image(self.run.silhouette_file(c, frame), gray=True) for c in cameras]
-        voxels = Voxels.read(self.run.frame_file("voxels", frame))
-        return FrameViews.of(self.undistortion.views(masks), images, voxels, self.settings.blurs_px, self.reduction)
+        if self.cloud_spacing is None:
+            surface = Voxels.read(self.run.frame_file("voxels", frame))
+        else:
+            surface = surface_voxels(read_cloud(self.run.frame_file("cloud", frame)), self.cloud_spacing)
+        return FrameViews.of(self.undistortion.views(masks), images, surface, self.settings.blurs_px, self.reduction)
