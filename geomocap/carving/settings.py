@@ -52,7 +52,10 @@ class CarvingSettings(Settings):
     """From silhouettes to coloured surface voxels."""
 
     resolution: int = Field(
-        default=256, ge=8, le=2048, description="voxels along the longest side of the volume (count)"
+        default=256,
+        ge=8,
+        le=2048,
+        description="voxels along the longest side of the subject, or of a given volume (count)",
     )
     voxel_size: float | None = Field(default=None, gt=0, description="edge of a voxel, instead of resolution (m)")
     volume: tuple[Point, Point] | None = Field(

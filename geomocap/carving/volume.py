@@ -14,6 +14,8 @@ from geomocap.carving.settings import CarvingSettings
 from geomocap.carving.views import PinholeViews
 from geomocap.errors import GeometryError
 
+MOST_VOXELS = 1 << 30  # one bit each: 128 MB; a longer way than this is carved more coarsely
+
 _DEFAULT = CarvingSettings()
 
 
@@ -21,6 +23,9 @@ def working_volume(
     frames: Iterable[PinholeViews], settings: CarvingSettings = _DEFAULT, numbers: Iterable[int] | None = None
 ) -> Grid:
     """Find the grid that holds the subject in all these frames, or make the one that the settings give.
+
+    A found grid has `resolution` voxels along the longest side that the subject (with margin) has in any frame; it is
+    longer where the subject moves on.
 
     Parameters
     ----------
@@ -40,6 +45,7 @@ def working_volume(
         low, high = (np.array(corner, dtype=np.float64) for corner in settings.volume)
         return Grid.of_box(low, high, resolution=settings.resolution, voxel_size=settings.voxel_size)
     box: tuple[np.ndarray, np.ndarray] | None = None
+    longest = 0.0
     for number, views in zip(count() if numbers is None else numbers, frames, strict=False):
         check_silhouettes(views, number, settings.hull.tolerance)
         found = subject_box(views, settings.hull)
@@ -47,8 +53,14 @@ def working_volume(
             check_agreement(views, number, settings.hull)
         if found is None:
             continue
+        longest = max(longest, float((found[1] - found[0]).max()))
         box = found if box is None else (np.minimum(box[0], found[0]), np.maximum(box[1], found[1]))
     if box is None:
         raise GeometryError("no frames to find the working volume from; give `carving.volume`")
-    margin = settings.margin * (box[1] - box[0]).max()
-    return Grid.of_box(box[0] - margin, box[1] + margin, resolution=settings.resolution, voxel_size=settings.voxel_size)
+    # The subject counts, not how far it goes: a runner is measured as finely as somebody who stands
+    edge = settings.voxel_size or (1 + 2 * settings.margin) * longest / settings.resolution
+    margin = settings.margin * longest
+    low, high = box[0] - margin, box[1] + margin
+    if settings.voxel_size is None:
+        edge = max(edge, float(np.cbrt(np.prod(high - low) / MOST_VOXELS)))
+    return Grid.of_box(low, high, voxel_size=edge)
