@@ -55,6 +55,7 @@ def segment_by_motion(job: Job, geometry: Geometry) -> int:
         joint_std=np.array([joint.std for joint in found.joints]).reshape(-1, 3),
         curve_bodies=np.array([step.bodies for step in bodies.curve]),
         curve_strengths=np.array([step.strength for step in bodies.curve]),
+        alternative_labels=bodies.alternatives(),
     )
     return frames
 

@@ -10,7 +10,8 @@ from scipy.sparse import csr_matrix
 
 from geomocap.errors import GeometryError
 from geomocap.progress import Progress, silent
-from geomocap.segmentation.body_elimination import Criterion, EliminationStep, eliminate
+from geomocap.segmentation.body_criteria import Criterion
+from geomocap.segmentation.body_elimination import EliminationStep, eliminate
 from geomocap.segmentation.body_model import BodyModel, Evidence, carry, model_of_labels, reassign, refit, settle_rest
 from geomocap.segmentation.connected_linkage import Linkage, connected_linkage
 from geomocap.segmentation.local_rotations import local_rotations, turn_distances
@@ -22,6 +23,8 @@ from geomocap.settings import Settings
 _LEAST_SAMPLES = 20
 _CERTAIN = 0.3
 _SETTLE_ROUNDS = 3
+_EARLY_SHARE = 0.8  # small groups may still grow
+_RADIUS = 0.05  # extents
 _STAGE = "bodies"
 
 
@@ -44,7 +47,13 @@ class MotionBodiesSettings(Settings):
     first_cut_deg: float = Field(
         default=9.0, gt=0, lt=180, description="groups of samples that turn less differently are the start (degrees)"
     )
-    min_share: float = Field(default=0.008, ge=0, lt=0.5, description="smallest body (share of the samples)")
+    min_share: float = Field(default=0.01, ge=0, lt=0.5, description="smallest body (share of the samples)")
+    soft_share: float = Field(
+        default=0.18,
+        ge=0,
+        lt=1,
+        description="soft skin turns by a fixed part of what the bodies beside it do, to this share of it (0..1)",
+    )
     neighbours: int = Field(default=10, ge=4, description="neighbours of a sample on the surface")
     max_stretch: float = Field(
         default=2.0, gt=1, description="neighbours that separate more are none (times the usual distance)"
@@ -91,7 +100,7 @@ class MotionBodies:
     adjacency : (N, N) csr_matrix
         Neighbours on the surface.
     curve : tuple of EliminationStep
-        Number of bodies as a function of how strict the criterion is.
+        Number of bodies as a function of how strict the criterion is, with the bodies at each step: the alternatives.
     linkage : Linkage
         Tree of the first grouping, whose cuts are the alternatives.
     extent : float, metres
@@ -122,6 +131,15 @@ class MotionBodies:
         middle = np.stack([self.rest[self.label == b].mean(axis=0) for b in range(self.body_count)])
         return np.einsum("tbij,bj->tbi", self.rotations, middle) + self.translations
 
+    def alternatives(self, most: int = 8) -> np.ndarray:
+        """Bodies of the samples if the criterion were a little weaker or stricter, (A, N) int32, nearest numbers first.
+
+        Where a trunk bends in many small steps, one cut is as good as another.
+        """
+        others = {step.bodies: step.label for step in self.curve if step.bodies != self.body_count}
+        nearest = sorted(others, key=lambda count: (abs(count - self.body_count), -count))[:most]
+        return np.array([others[count] for count in nearest], np.int32).reshape(-1, len(self.label))
+
 
 def find_motion_bodies(
     paths: MotionPaths, settings: MotionBodiesSettings | None = None, progress: Progress = silent
@@ -131,7 +149,8 @@ def find_motion_bodies(
     Every sample's neighbourhood on the surface has a rotation since frame 0, whatever lever arms there are. Samples
     that turn alike are grouped (average linkage along the surface), too finely. Each group gets a rigid motion, each
     sample follows one body or a blend of two, and then the weakest body goes, again and again, until each one left
-    turns against its neighbours and is not explained by blends of them.
+    turns against its neighbours and is not explained by blends of them. At last, parts of soft skin go, which turn by a
+    fixed share of what the bodies beside them do, and bodies of too few samples.
 
     Parameters
     ----------
@@ -166,7 +185,7 @@ def find_motion_bodies(
     certain = np.full(paths.count, True) if paths.reference is not None else paths.seen[:, 0]
     evidence = _evidence(positions, weights, paths, reference, certain, turns, graph, extent, settings)
     linkage = connected_linkage(turns, graph.neighbours)
-    least = max(6, round(settings.min_share * paths.count))
+    least = max(6, round(_EARLY_SHARE * settings.min_share * paths.count))
     label = absorb_small(linkage.cut(np.deg2rad(settings.first_cut_deg)), turns, graph, least)
     if settings.bodies > int(label.max()) + 1:
         label = linkage.cut_count(settings.bodies)
@@ -177,11 +196,12 @@ def find_motion_bodies(
             model = reassign(refit(model, evidence, np.arange(model.count)), evidence, 1).compact()
     progress(_STAGE, 3, 4)
     # Those that are there
-    criterion = Criterion(np.deg2rad(settings.min_turn_deg), np.deg2rad(settings.min_excess_deg), 0.05 * extent)
-    model, evidence, curve = eliminate(model, evidence, criterion, settings.bodies or None)
-    model = reassign(model, evidence, 3).compact()
+    turn, excess = np.deg2rad(settings.min_turn_deg), np.deg2rad(settings.min_excess_deg)
+    criterion = Criterion(turn, excess, _RADIUS * extent, settings.min_share, settings.soft_share)
+    left = eliminate(model, evidence, criterion, settings.bodies or None)
+    model = reassign(left.model, left.evidence, 3).compact()
     progress(_STAGE, 4, 4)
-    return _result(model, evidence, paths, graph, curve, linkage, extent)
+    return _result(model, left.evidence, paths, graph, left.curve, linkage, extent)
 
 
 def _known_rotations(paths: MotionPaths, fitted: np.ndarray) -> np.ndarray:
@@ -243,7 +263,7 @@ def _result(
     evidence: Evidence,
     paths: MotionPaths,
     graph: SurfaceGraph,
-    curve: list[EliminationStep],
+    curve: tuple[EliminationStep, ...],
     linkage: Linkage,
     extent: float,
 ) -> MotionBodies:
@@ -274,7 +294,7 @@ def _result(
         residuals,
         graph.lasting,
         graph.adjacency,
-        tuple(curve),
+        curve,
         linkage,
         extent,
     )

@@ -5,6 +5,7 @@ from scipy.spatial.distance import squareform
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
+from geomocap.segmentation.body_criteria import fixed_share
 from geomocap.segmentation.connected_linkage import connected_linkage
 from geomocap.segmentation.local_rotations import local_rotations, turn_distances
 from geomocap.segmentation.motion_bodies import MotionBodiesSettings, find_motion_bodies
@@ -80,6 +81,56 @@ def test_soft_skin_is_no_body_of_its_own():
     assert same_partition(bodies.label[rigid], (weight[rigid] > 0.5).astype(int)) == 1.0
     of_second = bodies.weights[:, bodies.label[np.argmax(rest[:, 0])]]
     assert np.abs(of_second - weight)[~rigid].mean() < 0.12  # even blends are penalised
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_deep_soft_skin_between_three_bodies_is_no_fourth(seed):
+    three = chain(3, samples=200, turn_deg=70.0, seed=seed)
+    rest = three.positions[:, 0]
+    up, down = (np.clip((rest[:, 0] - joint + 0.25) / 0.5, 0.0, 1.0) for joint in (0.4, 0.8))
+    up, down = (share**2 * (3.0 - 2.0 * share) for share in (up, down))
+    weights = np.stack([1 - up, up * (1 - down), up * down], axis=1)
+    weights /= weights.sum(axis=1, keepdims=True)
+    carried = np.einsum("tbij,nj->nbti", three.rotations, rest) + three.translations.swapaxes(0, 1)[None]
+    paths = MotionPaths(np.einsum("nb,nbti->nti", weights, carried))
+    assert find_motion_bodies(paths, MotionBodiesSettings(soft_share=0.0)).body_count > 3
+    bodies = find_motion_bodies(paths)
+    assert bodies.body_count == 3
+    core = weights.max(axis=1) > 0.8
+    assert same_partition(bodies.label[core], weights[core].argmax(axis=1)) > 0.97
+
+
+def test_fixed_share_of_a_turn():
+    rng = np.random.default_rng(9)
+    first = Rotation.from_rotvec(rng.normal(scale=0.4, size=(30, 3)))
+    turns = rng.normal(scale=0.4, size=(30, 3))
+    middle, second = first * Rotation.from_rotvec(0.3 * turns), first * Rotation.from_rotvec(turns)
+    share, miss, turn = fixed_share(first.as_matrix(), middle.as_matrix(), second.as_matrix())
+    assert share == pytest.approx(0.3)
+    assert miss < 1e-9
+    assert turn == pytest.approx(np.quantile(np.linalg.norm(turns, axis=1), 0.95))
+    other = first * Rotation.from_rotvec(rng.normal(scale=0.4, size=(30, 3)))
+    assert fixed_share(first.as_matrix(), other.as_matrix(), second.as_matrix())[1] > 0.3
+
+
+def test_alternatives_have_other_numbers_of_bodies_nearest_first(found):
+    alternatives = found.alternatives()
+    counts = [len(np.unique(label)) for label in alternatives]
+    assert alternatives.shape[1] == len(found.label)
+    assert found.body_count not in counts
+    assert counts[0] == 2
+    assert [abs(c - 3) for c in counts] == sorted(abs(c - 3) for c in counts)
+
+
+@pytest.mark.parametrize("moving", [True, False])
+def test_a_single_rigid_body_is_one_without_joints(moving):
+    one = chain(1, samples=150)
+    positions = one.positions if moving else np.repeat(one.positions[:, :1], 24, axis=1)
+    bodies = find_motion_bodies(MotionPaths(positions))
+    assert bodies.body_count == 1
+    skeleton = find_motion_skeleton(bodies, 30.0).skeleton
+    assert skeleton.joint_positions.shape == (24, 0, 3)
+    assert skeleton.root == 0
 
 
 def test_broken_paths_give_the_same_bodies(three):

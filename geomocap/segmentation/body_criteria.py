@@ -1,0 +1,217 @@
+"""When a body is one: it turns against its neighbours, blends of these do not explain it, and it is no soft skin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from geomocap.segmentation.body_model import BodyModel, Evidence
+from geomocap.segmentation.rigid_motions import relative_turn
+
+_MOST_SAMPLES = 80
+_MOST_NEIGHBOURS = 7
+_CORE = 0.4
+_CLEARLY = np.deg2rad(40.0)
+_TIP_QUANTILE = 0.8
+_TURN_SHARE = 0.02
+_LEAST_SEEN = 0.1
+_LEAST_FRAMES = 5
+_FEIGNED = 1.0
+_LEAST_CONTACTS = 3
+_ALSO_TOUCHES = 0.5  # a neighbour hangs on another body as well if its border with that is at least this long
+_SOFT_EXCESS = np.deg2rad(12.0)  # what blends miss by more than this is no soft skin, whatever its turn
+_LEAF_EXCESS = np.deg2rad(6.0)
+_SOFT_FLOOR = np.deg2rad(1.0)
+_QUANTILE = 0.95
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """When a body is one.
+
+    Attributes
+    ----------
+    min_turn : float, radians
+        It turns at least this much against each neighbour, and
+    min_excess : float, radians
+        blends of its neighbours miss its samples by at least this angle, seen from its middle.
+    largest_radius : float, metres
+        Radius of gyration from which on that angle is no longer counted smaller.
+    min_share : float
+        It has at least this share of the samples.
+    soft_share : float
+        It is soft skin between two bodies if it turns by a fixed part of their turn, to within this share of it.
+    """
+
+    min_turn: float
+    min_excess: float
+    largest_radius: float
+    min_share: float = 0.0
+    soft_share: float = 0.18
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A body and what speaks for it.
+
+    Attributes
+    ----------
+    body : int
+    strength : float
+        The least of what speaks for it, as a share of what is required; below 1 it is no body.
+    into : int
+        Neighbour that turns most alike; -1: its samples go to blends of the neighbours.
+    turn, excess : float, radians
+    """
+
+    body: int
+    strength: float
+    into: int
+    turn: float
+    excess: float
+
+
+def judge(body: int, model: BodyModel, evidence: Evidence, criterion: Criterion) -> Candidate:
+    """What speaks for a body: how far it turns against its neighbours, and how badly these explain it."""
+    neighbours = np.flatnonzero(model.adjacent(evidence.adjacency)[body])
+    members = np.flatnonzero(model.label == body)
+    if not len(neighbours) or not len(members):
+        return Candidate(body, np.inf, -1, np.inf, np.inf)
+    turns = [_turn(body, int(q), model, evidence) for q in neighbours]
+    turn, into = min(zip(turns, neighbours.tolist(), strict=True))
+    rest = evidence.rest[members]
+    radius = min(float(np.sqrt(((rest - rest.mean(axis=0)) ** 2).sum(axis=1).mean())), criterion.largest_radius)
+    if len(members) > _MOST_SAMPLES:
+        members = members[np.linspace(0, len(members) - 1, _MOST_SAMPLES).astype(int)]
+    reached = np.bincount(model.label[evidence.near[members].indices], minlength=model.count)
+    reached[body] = 0
+    reached[neighbours] += len(model.label)  # those that touch come first
+    others = np.argsort(-reached, kind="stable")[: min(_MOST_NEIGHBOURS, int((reached > 0).sum()))]
+    any_pair = np.ones((model.count, model.count), bool)
+    without = np.zeros((len(members), model.count), bool)
+    without[:, others] = True
+    alone = np.zeros_like(without)
+    alone[:, body] = True
+    by_others = evidence.explain(members, model, without, any_pair, 0.0).costs.min(axis=1)
+    by_itself = evidence.explain(members, model, alone, any_pair, 0.0).costs.min(axis=1)
+    # the samples that are most clearly this body's own: it must have a core, not only a gradual change
+    own = np.argsort(by_itself - by_others, kind="stable")[: max(5, int(_CORE * len(members)))]
+    gain = by_others[own].mean() - by_itself[own].mean()
+    # what the standard deviation of the positions could feign is no evidence
+    sigma = float(np.sqrt((evidence.sigma[members] ** 2).mean()))
+    excess = float(np.arctan2(np.sqrt(max(gain - (_FEIGNED * sigma) ** 2, 0.0)), max(radius, 1e-9)))
+    turn = max(turn - float(np.arctan2(_FEIGNED * sigma, max(radius, 1e-9))), 0.0)
+    by_turn, by_excess = turn / criterion.min_turn, excess / criterion.min_excess
+    return Candidate(body, min(by_turn, by_excess), into if by_turn < by_excess else -1, turn, excess)
+
+
+def _turn(first: int, second: int, model: BodyModel, evidence: Evidence) -> float:
+    """Turn of two bodies against each other: mean of that of their motions and of their most different parts."""
+    known = _seen(first, model, evidence) & _seen(second, model, evidence)
+    if known.sum() < min(_LEAST_FRAMES, len(known)):
+        known[:] = True
+    one, other = model.rotations[first, known], model.rotations[second, known]
+    if min(evidence.certain[model.label == body].sum() for body in (first, second)) < 3:
+        # nothing ties the body to the reference: its turn counts from the middle of the frames
+        at = len(one) // 2
+        return relative_turn(one @ one[at].T, other @ other[at].T, _TURN_SHARE)
+    turn = relative_turn(one, other, _TURN_SHARE)
+    if turn > _CLEARLY:
+        return turn
+    a = np.flatnonzero((model.label == first) & model.core)
+    b = np.flatnonzero((model.label == second) & model.core)
+    if min(len(a), len(b)) < 4:
+        return turn
+    return 0.5 * (turn + float(np.quantile(evidence.turns[np.ix_(a, b)], _TIP_QUANTILE)))
+
+
+def _seen(body: int, model: BodyModel, evidence: Evidence) -> np.ndarray:
+    """Frames in which enough samples of a body are seen to know its motion, (T,) bool."""
+    seen = evidence.seen[model.label == body]
+    return seen.sum(axis=0) >= max(3, _LEAST_SEEN * len(seen))
+
+
+def judge_softness(body: int, model: BodyModel, evidence: Evidence, criterion: Criterion) -> Candidate:
+    """What speaks for a body once there are not too many: as `judge`, and that it is neither soft skin nor too small.
+
+    Skin between two bodies follows both. Where it is deep, as on a thigh, no two of its samples follow them in the same
+    way, and parts of it look like bodies that turn by ten or twenty degrees each. But such a part turns by a fixed
+    share of the turn of the bodies beside it, whatever they do; a body of its own does not. A trunk between two limbs
+    is no skin, even if it turns by half of what they turn: other bodies hang on it that do not touch these limbs.
+    """
+    found = judge(body, model, evidence, criterion)
+    if not np.isfinite(found.strength):
+        return found
+    contacts = model.contacts(evidence.adjacency)
+    neighbours = np.flatnonzero(contacts[body] >= _LEAST_CONTACTS)
+    share = float((model.label == body).mean())
+    if share < criterion.min_share:
+        turns = [_turn(body, int(q), model, evidence) for q in neighbours]
+        into = int(neighbours[np.argmin(turns)])
+        return Candidate(body, 0.5 * share / criterion.min_share, into, found.turn, found.excess)
+    softness, at_end = _between_two(body, neighbours, contacts, model, evidence, criterion)
+    if np.isfinite(softness):
+        strength = max(softness, found.excess / _SOFT_EXCESS)
+    elif at_end or len(neighbours) == 1:
+        strength = found.excess / _LEAF_EXCESS
+    else:
+        return found
+    return Candidate(body, strength, -1, found.turn, found.excess) if strength < found.strength else found
+
+
+def _between_two(
+    body: int,
+    neighbours: np.ndarray,
+    contacts: np.ndarray,
+    model: BodyModel,
+    evidence: Evidence,
+    criterion: Criterion,
+) -> tuple[float, bool]:
+    """How badly a fixed share of the turn of the two best neighbours is that of a body; 1: as much as skin may.
+
+    Also whether it turns at least as much as one of two neighbours against the other.
+    """
+    softness, at_end = np.inf, False
+    for i, a in enumerate(neighbours):
+        for b in neighbours[:i]:
+            others = neighbours[(neighbours != a) & (neighbours != b)]
+            elsewhere = np.maximum(contacts[others, a], contacts[others, b])
+            if (elsewhere < _ALSO_TOUCHES * contacts[others, body]).any():
+                continue
+            known = _seen(body, model, evidence) & _seen(int(a), model, evidence) & _seen(int(b), model, evidence)
+            if known.sum() < min(_LEAST_FRAMES, len(known)):
+                known[:] = True
+            share, miss, turn = fixed_share(
+                model.rotations[a, known], model.rotations[body, known], model.rotations[b, known]
+            )
+            if 0.0 < share < 1.0:
+                softness = min(softness, miss / (_SOFT_FLOOR + criterion.soft_share * turn))
+            else:
+                at_end = True
+    return softness, at_end
+
+
+def fixed_share(first: np.ndarray, middle: np.ndarray, second: np.ndarray) -> tuple[float, float, float]:
+    """Share of the turn between two motions that a third one turns from the first on, least squares over time.
+
+    Parameters
+    ----------
+    first, middle, second : (T, 3, 3) float
+        Rotations.
+
+    Returns
+    -------
+    share : float
+        0 to 1.
+    miss : float, radians
+        By which turning by that share misses the third motion in the 95th percentile of the frames.
+    turn : float, radians
+        95th percentile of the angle between first and second.
+    """
+    whole = Rotation.from_matrix(first.swapaxes(1, 2) @ second).as_rotvec()
+    part = Rotation.from_matrix(first.swapaxes(1, 2) @ middle).as_rotvec()
+    share = float(np.clip((whole * part).sum() / max((whole * whole).sum(), 1e-12), 0.0, 1.0))
+    miss = (Rotation.from_rotvec(-share * whole) * Rotation.from_rotvec(part)).magnitude()
+    return share, float(np.quantile(miss, _QUANTILE)), float(np.quantile(np.linalg.norm(whole, axis=1), _QUANTILE))
