@@ -8,13 +8,12 @@ import numpy as np
 from pydantic import Field
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from geomocap.errors import GeometryError
 from geomocap.segmentation.motion_bodies import MotionBodies
-from geomocap.segmentation.surface_graph import frames_looked_at
 from geomocap.settings import Settings
 from geomocap.skeleton.articulated_motion import fit_articulated, prior_moments
+from geomocap.skeleton.borders import Border, contacts, find_borders
 from geomocap.skeleton.common_points import CommonPoint, common_point
 from geomocap.skeleton.hierarchy import Hierarchy
 from geomocap.skeleton.motion import local_rotations
@@ -22,8 +21,6 @@ from geomocap.skeleton.skeleton import Skeleton
 from geomocap.skeleton.spanning_tree import Connection, connect_by_cost, connection_cost
 from geomocap.skeleton.temporal_smoothing import smooth_positions, smooth_rotations
 
-_NEAREST = 6
-_FRAMES = 10
 _UNSEEN = 0.05
 _BRIDGE = 1e-3
 
@@ -128,74 +125,39 @@ def possible_connections(bodies: MotionBodies, settings: MotionSkeletonSettings)
     """Joints between all bodies that come near each other, and more until every body can be reached."""
     count = bodies.body_count
     limit = settings.largest_gap * bodies.extent
-    gaps, interfaces = _interfaces(bodies, limit)
-    contact = _contacts(bodies)
-    border = np.maximum(contact.sum(axis=1), 1)
-    while connected_components(csr_matrix(gaps <= limit))[0] > 1:
+    borders = find_borders(bodies, limit)
+    while connected_components(_reached(borders, count))[0] > 1:
         limit *= 2.0
-        gaps, interfaces = _interfaces(bodies, limit)
+        borders = find_borders(bodies, limit)
+    contact = contacts(bodies)
+    whole = np.maximum(contact.sum(axis=1), 1)
     weights = (settings.interface_weight, settings.gap_weight, settings.contact_weight * bodies.extent)
     noise = 2e-4 * bodies.extent
     result = []
-    for a in range(count):
-        for b in range(a + 1, count):
-            if gaps[a, b] > limit:
-                continue
+    for (a, b), border in borders.items():
+        motions = (
+            (bodies.rotations[:, a], bodies.rotations[:, b]),
+            (bodies.translations[:, a], bodies.translations[:, b]),
+        )
+        reliability = np.minimum(bodies.reliability[:, a], bodies.reliability[:, b]) + 1e-3
+        interface = border.middle
+        joint = common_point(*motions, reliability, interface, settings.interface_prior, noise, settings.hinge_share)
+        if joint.hinge:
+            # every point of its axis is common: the joint is in the middle of what the bodies share of it
+            interface = border.middle_along(joint.point, joint.axis)
             joint = common_point(
-                (bodies.rotations[:, a], bodies.rotations[:, b]),
-                (bodies.translations[:, a], bodies.translations[:, b]),
-                np.minimum(bodies.reliability[:, a], bodies.reliability[:, b]) + 1e-3,
-                interfaces[a, b],
-                settings.interface_prior,
-                noise,
-                settings.hinge_share,
+                *motions, reliability, interface, settings.interface_prior, noise, settings.hinge_share
             )
-            off = float(np.linalg.norm(joint.point - interfaces[a, b]))
-            share = float(contact[a, b] / min(border[a], border[b]))
-            cost = connection_cost(joint.miss, off, gaps[a, b], share, weights)
-            result.append(Connection((a, b), joint, interfaces[a, b], float(gaps[a, b]), cost))
+        off = float(np.linalg.norm(joint.point - interface))
+        share = float(contact[a, b] / min(whole[a], whole[b]))
+        cost = connection_cost(joint.miss, off, border.gap, share, weights)
+        result.append(Connection((a, b), joint, interface, border.gap, cost))
     return result
 
 
-def _interfaces(bodies: MotionBodies, limit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Lasting distance of each two bodies beyond that of neighbours, and the middle of their border in frame 0.
-
-    A sample is on the border if it stays near the other body, though perhaps not near the same sample of it: a shaft
-    that turns in its bearing touches it all around.
-    """
-    count = bodies.body_count
-    apart = bodies.lasting + np.diag(np.full(len(bodies.lasting), np.inf, np.float32))
-    spacing = float(np.median(apart.min(axis=1)))
-    members = [np.flatnonzero(bodies.label == b) for b in range(count)]
-    looked_at = frames_looked_at(bodies.positions.shape[1], _FRAMES)
-    moved = [bodies.positions[m][:, looked_at] for m in members]
-    trees = [[cKDTree(part[:, f]) for f in range(len(looked_at))] for part in moved]
-    gaps = np.full((count, count), np.inf)
-    interfaces = np.zeros((count, count, 3))
-    np.fill_diagonal(gaps, 0.0)
-    for a in range(count):
-        for b in range(a + 1, count):
-            if bodies.lasting[np.ix_(members[a], members[b])].min() > limit:
-                continue
-            sides, nearest = [], []
-            for one, other in ((a, b), (b, a)):
-                distances = np.stack([trees[other][f].query(moved[one][:, f])[0] for f in range(len(looked_at))])
-                lasting = np.sort(distances, axis=0)[-2 if len(looked_at) > 5 else -1]
-                few = np.sort(lasting)[: min(_NEAREST, len(lasting))]
-                near = lasting <= max(float(few[-1]), 1.5 * spacing)
-                sides.append(bodies.rest[members[one][near]].mean(axis=0))
-                nearest.append(float(few[:3].mean()))
-            gaps[a, b] = gaps[b, a] = max(min(nearest) - 2.0 * spacing, 0.0)
-            interfaces[a, b] = interfaces[b, a] = 0.5 * (sides[0] + sides[1])
-    return gaps, interfaces
-
-
-def _contacts(bodies: MotionBodies) -> np.ndarray:
-    rows, columns = bodies.adjacency.nonzero()
-    result = np.zeros((bodies.body_count, bodies.body_count))
-    np.add.at(result, (bodies.label[rows], bodies.label[columns]), 1)
-    np.fill_diagonal(result, 0)
-    return result
+def _reached(borders: dict[tuple[int, int], Border], count: int) -> csr_matrix:
+    rows, columns = np.array(list(borders), int).reshape(-1, 2).T
+    return csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
 
 
 def skeleton_of_motion(

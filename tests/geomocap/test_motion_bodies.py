@@ -16,6 +16,7 @@ from geomocap.segmentation.skin_blending import explain
 from geomocap.segmentation.surface_graph import lasting_distances, surface_graph
 from geomocap.segmentation.track_completion import complete_tracks
 from geomocap.skeleton.articulated_motion import fit_articulated, prior_moments
+from geomocap.skeleton.borders import Border
 from geomocap.skeleton.common_points import common_point
 from geomocap.skeleton.hierarchy import Hierarchy
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
@@ -162,6 +163,19 @@ def test_joints_hinges_and_tree_of_a_chain(three, found):
         assert np.linalg.norm(three.joints[true] - position) < 0.04  # along the axis the border decides
         assert joint.hinge
         assert np.rad2deg(np.arccos(min(1.0, abs(joint.axis @ three.axes[true])))) < 1.0
+
+
+def test_hinges_are_in_the_middle_of_what_both_bodies_share_of_the_axis():
+    rng = np.random.default_rng(12)
+    chest = rng.random((300, 3)) * [1.0, 0.5, 0.3]
+    lid = rng.random((200, 3)) * [0.6, 0.5, 0.02] + [0.2, 0.0, 0.3]
+    along_edge = Border(0.0, (chest[chest[:, 1] < 0.1], lid[(lid[:, 1] < 0.1)]), (chest, lid), 0.05)
+    edge, x = np.array([0.1, 0.0, 0.3]), np.array([1.0, 0.0, 0.0])
+    np.testing.assert_allclose(along_edge.middle_along(edge, x), [0.5, 0.0, 0.3], atol=0.02)
+    tower = rng.random((200, 3)) * [0.2, 0.2, 1.0] + [0.4, 0.2, 0.3]
+    turntable = Border(0.0, (chest[chest[:, 2] > 0.28], tower[tower[:, 2] < 0.32]), (chest, tower), 0.05)
+    pivot, z = np.array([0.5, 0.3, 0.9]), np.array([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(turntable.middle_along(pivot, z), [0.5, 0.3, 0.3], atol=0.02)
 
 
 def test_joints_stay_fixed_in_both_bodies_and_follow_forward_kinematics(found):
