@@ -24,6 +24,7 @@ from geomocap.matching.plane_sweep import SweepImages
 from geomocap.matching.seeds import DepthRange, find_seeds
 
 DENSE, COARSE = 1.5, 2.0  # distances of neighbouring points where one or several templates see the surface, pixels
+SMALL = 320  # edge of images in which neighbouring points are a pixel apart
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,8 @@ def grid_step(groups: MatchGroups, group: MatchGroup, settings: CloudSettings) -
         focal = groups.rig.cameras[group.template].mean_focal_length()
         return max(settings.spacing * focal / group.depth, 1.0)
     # Where several templates see a surface it gets more points than one template's
-    return settings.growing.step or (DENSE if len(groups.groups) == 1 else COARSE)
+    usual = DENSE if len(groups.groups) == 1 else COARSE
+    return settings.growing.step or float(np.clip(groups.rig.sizes[group.template].max() / SMALL, 1.0, usual))
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geomocap.cameras import Rig
+from geomocap.cloud.bounds import Box
 from geomocap.cloud.settings import GroupSettings
 from geomocap.errors import CalibrationError
 from geomocap.matching.epipolar import transfers
+
+_PARALLEL = 0.0012  # squared sine of two degrees: axes that differ less from their mean don't meet in a scene
+_ANYWHERE = (0.15, 6.0)  # bounds of the depth where axes don't meet, in distances of the scene
 
 
 @dataclass(frozen=True)
@@ -61,16 +65,25 @@ class MatchGroups:
     spare: tuple[MatchGroup, ...] = ()
 
 
-def scene_center(rig: Rig) -> np.ndarray:
-    """Point nearest to all optical axes, (3,) float, metres, world."""
+def scene_center(rig: Rig) -> tuple[np.ndarray, bool]:
+    """Point nearest to all optical axes, (3,) float, metres, world, and whether they really meet there.
+
+    Axes that are all but parallel, or part, leave it open: then it is put before the cameras, at eight times the
+    distance between them.
+    """
     d = rig.viewing_directions
     across = np.eye(3) - d[:, :, None] * d[:, None, :]
-    # Parallel axes leave their direction open: the point nearest to the cameras is taken then
-    A = across.sum(axis=0) + 1e-6 * np.eye(3)
-    return np.linalg.solve(A, (across @ rig.centers[:, :, None]).sum(axis=0)[:, 0] + 1e-6 * rig.centers.mean(axis=0))
+    total = across.sum(axis=0)
+    if np.linalg.eigvalsh(total)[0] > len(rig) * _PARALLEL:
+        center = np.linalg.solve(total, (across @ rig.centers[:, :, None]).sum(axis=0)[:, 0])
+        if (np.einsum("ci,ci->c", center - rig.centers, d) > 0).all():
+            return center, True
+    middle, forward = rig.centers.mean(axis=0), d.mean(axis=0)
+    base = max(float(np.linalg.norm(a - b)) for a in rig.centers for b in rig.centers)
+    return middle + 8 * base * forward / max(float(np.linalg.norm(forward)), 1e-12), False
 
 
-def match_groups(rig: Rig, settings: GroupSettings | None = None) -> MatchGroups:
+def match_groups(rig: Rig, settings: GroupSettings | None = None, box: Box | None = None) -> MatchGroups:
     """Choose templates and their search cameras.
 
     A template is matched with cameras whose directions to the middle of the scene differ enough for precision and
@@ -81,6 +94,8 @@ def match_groups(rig: Rig, settings: GroupSettings | None = None) -> MatchGroups
     rig : Rig
         At least two cameras.
     settings : GroupSettings, optional
+    box : Box, optional
+        Region of interest; its middle is that of the scene then.
 
     Raises
     ------
@@ -89,7 +104,8 @@ def match_groups(rig: Rig, settings: GroupSettings | None = None) -> MatchGroups
     """
     settings = settings or GroupSettings()
     pinhole = rig.undistorted()
-    center = scene_center(rig)
+    center, meet = scene_center(rig) if box is None else (np.mean(box, axis=0), True)
+    near, far = (settings.near, settings.far) if meet else _ANYWHERE
     rays = center - rig.centers
     distance = np.linalg.norm(rays, axis=1)
     rays /= distance[:, None]
@@ -101,7 +117,7 @@ def match_groups(rig: Rig, settings: GroupSettings | None = None) -> MatchGroups
         if len(searches):
             T = transfers(pinhole, t, searches.tolist())
             depth = float((center - rig.centers[t]) @ rig.viewing_directions[t])
-            groups.append(MatchGroup(t, searches, T, depth, settings.near * depth, settings.far * depth))
+            groups.append(MatchGroup(t, searches, T, depth, near * depth, far * depth))
     if not groups:
         off = angles[~np.eye(len(rig), dtype=bool)]
         raise CalibrationError(

@@ -69,7 +69,7 @@ class CloudSettings(Settings):
         None, gt=0, description="distance of neighbouring points on the surface, instead of growing.step (m)"
     )
     least_views: int = Field(2, ge=2, description="cameras that have to see a point, the template included")
-    contour_margin: int = Field(2, ge=0, description="pixels along a silhouette's contour that are not used (px)")
+    contour_margin: int = Field(1, ge=0, description="pixels along a silhouette's contour that are not used (px)")
     silhouette_margin: int = Field(3, ge=0, description="how far points may project outside other silhouettes (px)")
     hull_depth: float = Field(
         0.1, gt=0, description="how far behind the hull's front the surface is sought, in diagonals of the hull"

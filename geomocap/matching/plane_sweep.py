@@ -148,7 +148,7 @@ def sweep(
         for m in range(steps):
             promise[m] = scores[m].max()
         for _ in range(min(steps, _PROMISING)):
-            m = np.argmax(promise)
+            m = int(np.argmax(promise))
             if not promise[m] > -1.5:
                 break
             promise[m] = -2.0

@@ -50,8 +50,8 @@ class GrowingSettings(Settings):
     step: float | None = Field(
         None,
         gt=0.25,
-        description="distance of neighbouring points in the template image; 1.5, and 2 with several templates, "
-        "if not given (px)",
+        description="distance of neighbouring points in the template image; if not given 1.5, 2 with several "
+        "templates, less in small images (px)",
     )
     order: Literal["best", "paper"] = Field(
         "best", description="best: best neighbour first; paper: sequential horizontal and vertical shifts"

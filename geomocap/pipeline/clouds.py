@@ -33,7 +33,7 @@ def clouds(job: Job) -> str:
     if capture is None:
         raise CaptureError("clouds need a capture")
     settings = cloud_settings(job.config.cloud, capture)
-    groups = match_groups(capture.rig, settings.groups)
+    groups = match_groups(capture.rig, settings.groups, capture.info.region_of_interest)
     bounds = bounds_of(capture, settings)
     before = {"hull": voxels, "silhouettes": silhouettes, "none": lambda _: ""}[bounds](job)
     pictures = capture.fingerprint("images", "videos", "sparse")
@@ -154,6 +154,6 @@ def measure_again(run: Run, capture: Capture, settings: CloudSettings, frame: in
     The settings are those of the run; silhouettes and hull are taken from it.
     """
     settings = cloud_settings(settings, capture)
-    groups = match_groups(capture.rig, settings.groups)
+    groups = match_groups(capture.rig, settings.groups, capture.info.region_of_interest)
     bounds = bounds_of(capture, settings)
     return _Measure(capture, run, settings, groups, bounds).measure(frame), groups

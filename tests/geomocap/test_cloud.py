@@ -216,7 +216,9 @@ def test_groups_take_neighbours_on_both_sides() -> None:
     named = match_groups(TRIPLET, GroupSettings(template_camera="cam2")).groups
     assert [g.template for g in named] == [2]
     assert len(match_groups(TRIPLET, GroupSettings(templates="all")).groups) == 3
-    np.testing.assert_allclose(scene_center(ring(6, 360)), 0, atol=1e-3)
+    center, meet = scene_center(ring(6, 360))
+    np.testing.assert_allclose(center, 0, atol=1e-3)
+    assert meet
 
 
 def test_groups_that_can_t_be() -> None:
@@ -327,3 +329,22 @@ def test_spacing_in_metres(sharp: CloudFrame) -> None:
     # Facing the camera, a ball's front is nearer than its middle
     near = np.median(cKDTree(frame.points.positions).query(frame.points.positions, 2)[0][:, 1])
     assert 0.013 < near < 0.021
+
+
+def test_parallel_axes_have_a_scene_too() -> None:
+    """Two cameras side by side, as in a stereo head."""
+    rig = ring(2, 20)
+    poses = np.array([rig.cam_from_world[0]] * 2)
+    base = 0.3
+    poses[1, 0, 3] -= base
+    stereo = Rig(rig.names, rig.cameras, poses)
+    center, meet = scene_center(stereo)
+    assert not meet
+    ahead = (center - stereo.centers) @ stereo.viewing_directions[0]
+    np.testing.assert_allclose(ahead, 8 * base, rtol=1e-6)
+    images, _ = photograph(stereo, Texture.random())
+    frame = measure(stereo, images, None, SETTINGS)
+    assert len(frame.points) > 500
+    assert np.mean(off_surface(frame.points.positions) < 0.02) > 0.98
+    middle = match_groups(stereo, box=((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))).groups[0].depth
+    assert middle == pytest.approx(float(-stereo.centers[0] @ stereo.viewing_directions[0]))
