@@ -8,6 +8,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Literal
 
+import numba
 import open3d as o3d
 
 from geomocap.capture import Capture, read_image
@@ -40,8 +41,8 @@ def clouds(job: Job) -> str:
     key = stage_key("cloud", bounds, before, pictures, settings.model_dump(), capture.info.region_of_interest)
 
     def work() -> int:
-        task = _Measure(capture, job.run, settings, groups, bounds)
         missing = [k for k in range(capture.n_frames) if not job.run.frame_file("cloud", k).exists()]
+        task = _Measure(capture, job.run, settings, groups, bounds, len(missing) == 1)
         for _ in map_items(task, missing, job.executor, "cloud", job.progress, 4):
             pass
         return len(missing)
@@ -79,9 +80,16 @@ class _Measure:
     settings: CloudSettings
     groups: MatchGroups
     bounds: Bounds
+    alone: bool = False  # one frame by itself has all cores
 
     def __call__(self, frame: int) -> None:
-        found = self.measure(frame)
+        before = numba.get_num_threads()
+        if self.alone:
+            numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+        try:
+            found = self.measure(frame)
+        finally:
+            numba.set_num_threads(before)
         record = {"points": len(found.points), "reasons": found.reasons, "warnings": found.warnings}
         write_text(self.run.path / "cloud" / f"{frame:06d}.json", json.dumps(record, indent=1))
         if not len(found.points):
