@@ -21,7 +21,7 @@ from geomocap.tracking.keypoints import Measured
 
 
 def keypoints(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder with tracks.npz.")],
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of `geomocap run`, `track` or `segment`.")],
     points: Annotated[
         Path | None,
         typer.Option("--points", metavar="FILE.toml", help="Key-points; RUN/keypoints.toml if not given."),

@@ -44,15 +44,14 @@ def keypoints(run: Run, file: KeyPointFile) -> FollowedKeyPoints:
         If the run has no trajectories, there are no key-points, one is placed in a frame that isn't there or where no
         trajectories are, or the frame rate isn't known.
     """
-    tracks = run_trajectories(run)
+    measured = Measured.of(run_trajectories(run))
     if not file.keypoint:
         raise RunError(f"{run.path}: no key-points are given; add [[keypoint]] tables, or place them with --edit")
     for p in file.keypoint:
-        if p.frame >= tracks.n_frames:
-            raise RunError(
-                f"key-point {p.name}: placed in frame {p.frame}, but {run.path} has frames 0 to {tracks.n_frames - 1}"
-            )
-    paths = follow_regions(Measured.of(tracks), file.keypoint)
+        if p.frame >= len(measured.places):
+            last = len(measured.places) - 1
+            raise RunError(f"key-point {p.name}: placed in frame {p.frame}, but {run.path} has frames 0 to {last}")
+    paths = follow_regions(measured, file.keypoint)
     for k, p in enumerate(file.keypoint):
         if paths.n_tracks[p.frame, k] == 0:
             reach = 1000 * REACH * p.radius
@@ -126,15 +125,23 @@ def run_fps(run: Run) -> float:
 
 
 def run_trajectories(run: Run) -> Trajectories:
-    """Read a run's trajectories.
+    """Read a run's trajectories; those of the surface's nodes if its bodies were found from them.
+
+    That is so where the images had too little texture to follow patches of the surface, and for scans.
 
     Raises
     ------
     RunError
-        If it has none.
+        If it has neither.
     """
+    if (run.path / "diagnostics.npz").is_file():
+        found = run.read_npz("diagnostics.npz")
+        if "sample_positions" in found and str(found.get("paths", "")) == "nodes":
+            return trajectories_of({"positions": found["sample_positions"]}, run.path / "diagnostics.npz")
     if not (run.path / "tracks.npz").exists():
-        raise RunError(f"{run.path}: has no tracks.npz; run `geomocap track CAPTURE {run.path}` first")
+        raise RunError(
+            f"{run.path}: has no tracks.npz; run `geomocap track CAPTURE {run.path}` or `geomocap run` first"
+        )
     return trajectories_of(run.read_npz("tracks.npz"), run.path / "tracks.npz")
 
 

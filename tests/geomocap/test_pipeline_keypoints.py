@@ -114,6 +114,17 @@ def test_run_without_trajectories(tmp_path):
         keypoints(Run(tmp_path), KeyPointFile(keypoint=(KeyPoint(name="a", center=(0, 0, 0)),)))
 
 
+def test_nodes_stand_in_where_bodies_were_found_from_them(scene):
+    run, file, truth = scene
+    positions = run.read_npz("tracks.npz")["positions"]
+    (run.path / "tracks.npz").unlink()
+    run.write_npz("diagnostics.npz", sample_positions=positions, paths=np.array("patches"))
+    with pytest.raises(RunError, match=r"has no tracks\.npz"):
+        keypoints(run, file)
+    run.write_npz("diagnostics.npz", sample_positions=positions, paths=np.array("nodes"))
+    np.testing.assert_allclose(keypoints(run, file).paths.positions, truth, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("points", "said"),
     [
