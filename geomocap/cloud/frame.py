@@ -261,10 +261,12 @@ def warnings_of(templates: Sequence[TemplateCloud], names: Sequence[str], settin
         for camera in (t.group.template, *residuals):
             took_part[camera] += 1
         matched[t.group.template] += int(t.surface.matched.sum())
-    for camera in sorted(took_part):
-        if matched[camera] == 0 and not any(t.doubt for t in templates):
-            warnings.append(
-                f"camera {names[camera]}: nothing matches in its images; is it black, blocked, out of focus, or its "
-                "calibration wrong?"
-            )
+    nothing = [names[c] for c in sorted(took_part) if matched[c] == 0]
+    if len(nothing) == len(took_part) and not warnings:
+        warnings.append("nothing matches in any image; are they black, mirrored, mixed up, or the calibration wrong?")
+    elif not any(t.doubt for t in templates):
+        warnings += [
+            f"camera {n}: nothing matches in its images; is it black, blocked, out of focus, or its calibration wrong?"
+            for n in nothing
+        ]
     return tuple(warnings)

@@ -46,10 +46,15 @@ def _correlate(flat, start, height, width, f, offsets, variance, position, affin
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def on_plane(
-    transfers, shapes, starts, flat, x, y, plane, f, offsets, variance, radius, position, affine, point, each, only
-):
-    """Mean correlation with the template patch laid on a plane, of all images or `only` one; each into `each`."""
+def on_plane(scene, x, y, plane, patch, work, only):
+    """Mean correlation with the template patch laid on a plane, of all images or `only` one; each into `each`.
+
+    `scene` is (transfers, shapes, starts, flat), `patch` what `template_patch` returns with the radius, and `work` the
+    buffers (position, affine, point, each).
+    """
+    transfers, shapes, starts, flat = scene
+    f, offsets, variance, radius = patch
+    position, affine, point, each = work
     each[:] = -2.0
     if not plane_start(transfers, x, y, plane, position, affine, point):
         return -2.0
@@ -91,28 +96,7 @@ def template_patch(flat, seen, height, width, ix, iy, radius):
 
 
 @njit(cache=True, nogil=True)
-def refine(
-    transfers,
-    shapes,
-    starts,
-    flat,
-    x,
-    y,
-    plane,
-    depth_step,
-    slope_step,
-    top,
-    f,
-    offsets,
-    variance,
-    radius,
-    position,
-    affine,
-    point,
-    trial,
-    each,
-    only,
-):
+def refine(scene, x, y, plane, depth_step, slope_step, top, patch, work, trial, only):
     """Improve a plane, one unknown after the other with halved steps; returns its mean correlation."""
     for _ in range(4):
         depth_step *= 0.5
@@ -121,24 +105,7 @@ def refine(
             for sign in (-1.0, 1.0):
                 trial[:] = plane
                 trial[unknown] += sign * (depth_step if unknown == 0 else slope_step)
-                total = on_plane(
-                    transfers,
-                    shapes,
-                    starts,
-                    flat,
-                    x,
-                    y,
-                    trial,
-                    f,
-                    offsets,
-                    variance,
-                    radius,
-                    position,
-                    affine,
-                    point,
-                    each,
-                    only,
-                )
+                total = on_plane(scene, x, y, trial, patch, work, only)
                 if total > top:
                     top = total
                     plane[:] = trial

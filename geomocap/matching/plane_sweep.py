@@ -88,12 +88,11 @@ def sweep(
         f, offsets, variance = template_patch(flat, seen, height, width, ix, iy, radius)
         if not variance > 0:
             continue
-        position = np.empty((images, 2))
-        affine = np.empty((images, 4))
-        point = np.empty(6)
-        plane = np.zeros(5)
-        trial = np.zeros(5)
-        each = np.empty(images)
+        point, each = np.empty(6), np.empty(images)
+        plane, trial = np.zeros(5), np.zeros(5)
+        scene = transfers, shapes, starts, flat
+        patch = f, offsets, variance, radius
+        work = np.empty((images, 2)), np.empty((images, 4)), point, each
         # Steps of μ that move the fastest image by `step`
         length = 0.0
         for k in range(images):
@@ -101,6 +100,8 @@ def sweep(
                 ax, ay = point[0], point[1]
                 if transfer(transfers[k], low, x, y, point):
                     length = max(length, math.hypot(ax - point[0], ay - point[1]))
+        if not length > 0:
+            continue
         steps = min(max(int(length / step) + 1, 2), 2000)
         scores = np.full((steps, images + 1), -2.0)
         tilt_of = np.zeros((steps, images + 1), np.int64)
@@ -122,24 +123,7 @@ def sweep(
                 continue
             plane[0] = mu
             plane[1] = plane[2] = 0.0
-            total = on_plane(
-                transfers,
-                shapes,
-                starts,
-                flat,
-                x,
-                y,
-                plane,
-                f,
-                offsets,
-                variance,
-                radius,
-                position,
-                affine,
-                point,
-                each,
-                -1,
-            )
+            total = on_plane(scene, x, y, plane, patch, work, -1)
             scores[m, :images] = each
             scores[m, images] = total
         tilt_of[:] = side * side // 2
@@ -156,24 +140,7 @@ def sweep(
                 plane[0] = low + (high - low) * (m + 0.5) / steps
                 plane[1] = plane[0] * tilt / focal * (t % side - tilts)
                 plane[2] = plane[0] * tilt / focal * (t // side - tilts)
-                total = on_plane(
-                    transfers,
-                    shapes,
-                    starts,
-                    flat,
-                    x,
-                    y,
-                    plane,
-                    f,
-                    offsets,
-                    variance,
-                    radius,
-                    position,
-                    affine,
-                    point,
-                    each,
-                    -1,
-                )
+                total = on_plane(scene, x, y, plane, patch, work, -1)
                 for k in range(images):
                     if each[k] > scores[m, k]:
                         scores[m, k] = each[k]
@@ -198,46 +165,8 @@ def sweep(
             top = scores[best, column]
             needed = least if only < 0 else pair_least
             if top > needed - lead:
-                top = refine(
-                    transfers,
-                    shapes,
-                    starts,
-                    flat,
-                    x,
-                    y,
-                    plane,
-                    unit,
-                    plane[0] * tilt / focal,
-                    top,
-                    f,
-                    offsets,
-                    variance,
-                    radius,
-                    position,
-                    affine,
-                    point,
-                    trial,
-                    each,
-                    only,
-                )
-            on_plane(
-                transfers,
-                shapes,
-                starts,
-                flat,
-                x,
-                y,
-                plane,
-                f,
-                offsets,
-                variance,
-                radius,
-                position,
-                affine,
-                point,
-                each,
-                only,
-            )
+                top = refine(scene, x, y, plane, unit, plane[0] * tilt / focal, top, patch, work, trial, only)
+            on_plane(scene, x, y, plane, patch, work, only)
             status = 0
             for m in range(steps):
                 if abs(m - best) > apart and scores[m, column] > top - lead * (1 if only < 0 else 2):

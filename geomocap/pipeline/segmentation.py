@@ -7,6 +7,7 @@ from typing import Any
 
 from geomocap.articulation.model import MODEL_FILE
 from geomocap.geometry import BodyPoints, Geometry
+from geomocap.pipeline.clouds import bounds_of
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.motion import segment_by_motion
 from geomocap.pipeline.sources import Source, geometry_of
@@ -26,7 +27,7 @@ def segment(job: Job, source: Source) -> str:
     by_motion = config.segmentation.method == "motion" and len(geometry) > 1
     settings: dict[str, Any] = {"segmentation": config.segmentation.model_dump()}
     if by_motion:
-        if job.capture is not None and config.segmentation.paths != "nodes":
+        if config.segmentation.paths != "nodes" and _has_volume(job, source):
             settings["tracks"] = tracks(job)
         settings |= {
             name: getattr(config, name).model_dump()
@@ -40,6 +41,13 @@ def segment(job: Job, source: Source) -> str:
     key = stage_key("segmentation", source_key, settings, job.fps)
     work = segment_by_motion if by_motion else segment_as_m3
     return job.stage("segmentation", key, outputs, lambda: work(job, geometry), [MODEL_FILE, WARNINGS_FILE])
+
+
+def _has_volume(job: Job, source: Source) -> bool:
+    """Whether there is a volume, on which the surface is tracked in the images."""
+    if job.capture is None:
+        return False
+    return source != "cloud" or bounds_of(job.capture, job.config.cloud) == "hull"
 
 
 def segment_as_m3(job: Job, geometry: Geometry) -> int:
