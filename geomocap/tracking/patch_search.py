@@ -185,6 +185,16 @@ def carry_lost(state: Followed, found: Alignment, good: np.ndarray) -> Alignment
     return found.at(positions, frames)
 
 
+def renewed(patches: Patches, found: Alignment, good: np.ndarray, view: FrameViews, templates: str) -> Patches:
+    """Take templates of measured patches again: "previous" all, "updated" those that fit badly by now, "first" none."""
+    if templates == "first":
+        return patches
+    stale = patches.has & good[:, None] & (found.by_camera > -1)
+    if templates == "updated":
+        stale &= found.by_camera < _NEW_TEMPLATE_CORRELATION
+    return with_templates(replace(patches, has=patches.has & ~stale), stale, view)
+
+
 def new_views(patches: Patches, found: Alignment, good: np.ndarray, view: FrameViews, slack_px: float) -> Patches:
     """Take templates in cameras that have come to see a patch that two others measured well."""
     sure = good & (found.correlation > _NEW_TEMPLATE_CORRELATION) & (found.n_views >= 2)

@@ -13,7 +13,7 @@ from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads
 from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.joining import join_broken
-from geomocap.tracking.patch_search import Followed, carry_lost, hiding_depth, judge, new_views, search
+from geomocap.tracking.patch_search import Followed, carry_lost, hiding_depth, judge, new_views, renewed, search
 from geomocap.tracking.patches import Patches, with_templates
 from geomocap.tracking.reacquisition import reacquire
 from geomocap.tracking.seeding import seed_for_one_camera, seed_patches, seed_spacing
@@ -171,7 +171,8 @@ def _next(
     shift = found.positions - old.positions
     turn = Rotation.from_matrix(found.frames @ np.swapaxes(old.frames, 1, 2)).as_rotvec()
     gap = np.where(good, 0, state.gap + 1)
-    moved = new_views(old.moved(found.positions, found.frames), found, good, view, settings.slack_px)
+    moved = renewed(old.moved(found.positions, found.frames), found, good, view, settings.templates)
+    moved = new_views(moved, found, good, view, settings.slack_px)
     record.measured(frame, state.identity[good], found, np.flatnonzero(good))
     double = good & np.isin(state.identity, _beside_older(*record.at(frame), _DOUBLE * spacing))
     beside = np.where(double, state.beside + 1, 0)

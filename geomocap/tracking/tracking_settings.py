@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from geomocap.settings import Settings
@@ -16,6 +18,9 @@ class TrackingSettings(Settings):
         None, ge=1, le=16, description="Reduction of the images; so that patches just cover the surface if not given"
     )
     blurs_px: tuple[float, float] = Field((2.5, 0.8), description="Blur of the coarse and the fine level (pixels)")
+    templates: Literal["first", "updated", "previous"] = Field(
+        "first", description="Template: the first view of a camera, a new one where it fits badly, or the last frame's"
+    )
     seed_every: int = Field(10, ge=1, description="Frames between two looks for surface without patches")
     seed_correlation: float = Field(0.85, gt=0, lt=1, description="Least correlation between cameras for a new patch")
     search_front: float = Field(0.015, ge=0, description="How far before the surface a new patch is looked for (m)")

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -9,6 +11,7 @@ from geomocap.errors import GeometryError
 from geomocap.geometry import Voxels
 from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.patch_kernel import align_patches
+from geomocap.tracking.patch_search import renewed
 from geomocap.tracking.patch_tracking import track_surface
 from geomocap.tracking.patches import Patches, align, with_templates
 from geomocap.tracking.seeding import image_reduction, patch_shape, seed_patches, seed_spacing, spread, surface_frames
@@ -270,6 +273,24 @@ def test_tracks_follow_the_true_surface(scene, views):
     assert np.degrees(np.median(turned)) < 5  # a patch is nine pixels wide
     assert (tracks.n_views[tracks.measured] >= 2).all()
     assert set(tracks.reasons()) <= set(REASONS)
+
+
+@pytest.mark.parametrize(("templates", "share"), [("first", 0.0), ("updated", 0.5), ("previous", 1.0)])
+def test_templates_are_taken_again_as_asked(scene, views, seeds, templates, share):
+    X, Q = moved(scene, seeds, 1)
+    every = np.arange(len(seeds))
+    found = align(seeds, every, X, Q, seeds.has, views[1], iterations=(4, 8), least_correlation=0.6)
+    fit = np.where(every[:, None] % 2, 0.8, 0.99)
+    found = replace(found, by_camera=np.where(found.by_camera > -1, fit, -1.0))
+    copy = replace(seeds, templates=seeds.templates.copy(), usable=seeds.usable.copy())
+    good = every % 5 > 0
+    again = renewed(copy.moved(X, Q), found, good, views[1], templates)
+    changed = (again.templates != seeds.templates).any(axis=(2, 3, 4)) & seeds.has
+    taken = changed.any(axis=1)
+    assert not taken[~good].any()
+    if templates == "updated":
+        assert not taken[every % 2 == 0].any()
+    assert abs(taken[good].mean() - share) < 0.1
 
 
 def test_tracking_repeats_bit_for_bit(views):
