@@ -36,7 +36,7 @@ class MotionBodiesSettings(Settings):
         default=15.0, gt=0, lt=180, description="a body turns at least this much against each neighbour (degrees)"
     )
     min_excess_deg: float = Field(
-        default=4.5,
+        default=3.5,
         gt=0,
         lt=90,
         description="blends of its neighbours must miss a body's core by at least this, seen from its middle (degrees)",

@@ -29,7 +29,7 @@ class MotionSkeletonSettings(Settings):
     """How joints are found between bodies, and how these are connected."""
 
     interface_prior: float = Field(
-        default=0.003,
+        default=0.005,
         gt=0,
         description="weight of the place where bodies touch (frames in which they turn by a radian)",
     )
