@@ -1,4 +1,4 @@
-"""What the bodies are found from: patches followed in the images, or nodes followed on the geometry."""
+"""What the bodies are found from: patches followed in the images, nodes followed on the geometry, or both together."""
 
 from __future__ import annotations
 
@@ -14,34 +14,51 @@ from geomocap.tracking.selection import spread_out
 SAMPLES = 1500  # motion paths that bodies are found from
 LEAST_SAMPLES = 300  # fewer long trajectories than these don't cover a subject: nodes are tracked instead
 LEAST_COVERAGE = 0.4  # nor do trajectories that are measured, on average, in a smaller share of the frames
+ANCHORS = 2000  # trajectories that keep nodes from sliding
+ANCHOR_SHARE = 0.1  # those are measured in this share of the frames at least
 
 
 def motion_paths(job: Job, geometry: Geometry) -> tuple[MotionPaths, str]:
-    """Motion paths and what they are, "patches" or "nodes", as `segmentation.paths` asks for.
+    """Motion paths and what they are: "patches", "nodes", or "both", nodes with patches as anchors.
 
     Raises
     ------
     GeometryError
-        If patches are asked for and there are too few.
+        If patches are asked for and there are none.
     """
     wanted = job.config.segmentation.paths
+    tracked = None
     if wanted != "nodes" and (job.run.path / "tracks.npz").exists():
         tracked = job.run.read_npz("tracks.npz")
-        chosen = spread_out(tracked["positions"], SAMPLES)
-        positions = tracked["positions"][chosen]
-        coverage = float(np.isfinite(positions[:, :, 0]).mean()) if len(chosen) else 0.0
-        enough = len(chosen) >= LEAST_SAMPLES and coverage >= LEAST_COVERAGE
-        if enough or (wanted == "patches" and len(chosen)):
-            return MotionPaths(positions, sigma=_filled(tracked["sigma"][chosen])), "patches"
+    if tracked is not None and wanted != "both":
+        paths = _patches(tracked)
+        if paths is not None and (wanted == "patches" or _covers(paths)):
+            return paths, "patches"
     if wanted == "patches":
         raise GeometryError(
             f"{job.run.path}: no surface patches could be followed in the images; set segmentation.paths = nodes"
         )
     features = geometry.features if job.config.nodes.colors else None
-    nodes = track_nodes(geometry.points, len(geometry), job.config.nodes, features, job.progress, job.executor)
-    return nodes.motion_paths(), "nodes"
+    anchors = None if tracked is None else _anchors(tracked)
+    nodes = track_nodes(geometry.points, len(geometry), job.config.nodes, features, job.progress, job.executor, anchors)
+    return nodes.motion_paths(), "nodes" if anchors is None else "both"
 
 
-def _filled(sigma: np.ndarray) -> np.ndarray:
-    """Standard deviations with the median where a sample was not seen."""
-    return np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma))
+def _patches(tracked: dict[str, np.ndarray]) -> MotionPaths | None:
+    """Long trajectories, evenly over the surface; None: there are none."""
+    chosen = spread_out(tracked["positions"], SAMPLES)
+    if not len(chosen):
+        return None
+    sigma = tracked["sigma"][chosen]
+    # standard deviations with the median where a sample was not seen
+    return MotionPaths(tracked["positions"][chosen], sigma=np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma)))
+
+
+def _covers(paths: MotionPaths) -> bool:
+    return paths.count >= LEAST_SAMPLES and float(paths.seen.mean()) >= LEAST_COVERAGE
+
+
+def _anchors(tracked: dict[str, np.ndarray]) -> np.ndarray | None:
+    """Trajectories (P, T, 3), metres, that nodes are held by; None: there are none."""
+    chosen = spread_out(tracked["positions"], ANCHORS, ANCHOR_SHARE)
+    return tracked["positions"][chosen] if len(chosen) else None

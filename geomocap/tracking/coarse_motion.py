@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from geomocap.tracking.anchors import Marks, find_homes
 from geomocap.tracking.correspondences import Pull, Target, pull
 from geomocap.tracking.deformation import BlockPattern, block_pattern, rotation_of, step, vector_of
 from geomocap.tracking.extremities import match_ends
@@ -40,10 +41,11 @@ class State:
 
 @dataclass(frozen=True)
 class CoarseTarget:
-    """A frame's points, thinned, and the ends of its limbs (E, 3), metres."""
+    """A frame's points, thinned, the ends of its limbs (E, 3), metres, and what is known of single points of it."""
 
     target: Target
     ends: np.ndarray
+    marks: Marks | None = None
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,10 @@ class CoarseModel:
         points = frame.target.points.turned_like(*self.graph.deform(state.x, state.R), 0.5 * self.graph.spacing)
         return replace(frame, target=replace(frame.target, points=points))
 
+    def marked(self, frame: CoarseTarget, homes: np.ndarray, positions: np.ndarray) -> CoarseTarget:
+        """Add to a frame what is known of points with homes (P, 3) and positions (P, 3), NaN where not known."""
+        return replace(frame, marks=Marks.of(self.graph, homes, positions)) if len(homes) else frame
+
     def cost(self, state: State, expected: State) -> float:
         """Cost of a state, and of being elsewhere than expected: limbs that seem to have changed places have not."""
         away = np.linalg.norm(state.x - expected.x, axis=1) / (2 * self.graph.spacing)
@@ -146,6 +152,8 @@ class CoarseModel:
         for scale, stiffness in schedule:
             c = max(scale * g.spacing, 2 * self.point_spacing)
             found = self._pull(frame.target, x, R, c)
+            if frame.marks is not None:
+                frame.marks.add_to(found.A, found.b, g, x, R, s.anchor_weight, c)
             x, R = self._step(x, R, found.A, found.b, stiffness)
         found = self._pull(frame.target, x, R, max(0.3 * g.spacing, 2 * self.point_spacing))
         strain = np.minimum(g.strain(x, R) / s.give, 1.0) ** 2
@@ -181,13 +189,36 @@ class CoarseModel:
         return step(g, self.pattern, x, R, weights, A, b, 60)
 
 
-def follow(model: CoarseModel, frames: list[CoarseTarget], reference: int, way: int) -> list[State]:
-    """States from the reference frame on, forwards (way 1) or backwards (way −1), the reference's first."""
+def follow(
+    model: CoarseModel, frames: list[CoarseTarget], reference: int, way: int, anchors: np.ndarray | None = None
+) -> tuple[list[State], np.ndarray]:
+    """Follow the surface from the reference frame on, forwards (way 1) or backwards (way −1).
+
+    Parameters
+    ----------
+    model : CoarseModel
+    frames : list of CoarseTarget
+    reference, way : int
+    anchors : (P, T, 3) float, metres, optional
+        Trajectories; NaN where not measured. Each one holds the surface from the frame on in which it is first met.
+
+    Returns
+    -------
+    states : list of State
+        The reference's first.
+    homes : (P, 3) float, metres
+        Where the anchors are in the reference frame; NaN: never met.
+    """
     states = [model.start()]
+    anchors = np.zeros((0, len(frames), 3)) if anchors is None else anchors
+    homes = anchors[:, reference].copy()
     end = len(frames) if way > 0 else -1
     for k in range(reference + way, end, way):
-        states.append(model.next_state(frames[k], states[-1], states[-2] if len(states) > 1 else None))
-    return states
+        frame = model.marked(frames[k], homes, anchors[:, k])
+        states.append(model.next_state(frame, states[-1], states[-2] if len(states) > 1 else None))
+        new = np.isnan(homes[:, 0])
+        homes[new] = find_homes(model.graph, states[-1].x, states[-1].R, anchors[new, k])
+    return states, homes
 
 
 def mend(model: CoarseModel, frames: list[CoarseTarget], states: list[State], reference: int, way: int) -> list[State]:

@@ -30,6 +30,9 @@ class NodeTrackingSettings(Settings):
     point_weight: float = Field(0.05, ge=0, le=1, description="pull along the surface relative to that across it")
     colors: bool = Field(True, description="whether the points' colours guide the nodes, where there are any")
     feature_weight: float = Field(1.0, ge=0, description="pull of features (colours) relative to that of the geometry")
+    anchor_weight: float = Field(
+        4.0, ge=0, description="pull of a trajectory that is known from the images relative to that of a point"
+    )
     feature_scale: float = Field(0.3, gt=0, description="difference of features that separates points")
     momentum: float = Field(0.9, ge=0, le=1, description="share of the last motion that is expected to go on")
     end_reach: float = Field(0.25, ge=0, description="limbs' ends are looked for within (share of the extent)")

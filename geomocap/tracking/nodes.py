@@ -13,6 +13,7 @@ from geomocap.errors import GeometryError
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads
 from geomocap.segmentation.motion_paths import MotionPaths
+from geomocap.tracking.anchors import Marks
 from geomocap.tracking.coarse_motion import CoarseModel, CoarseTarget, State, follow, mend
 from geomocap.tracking.correspondences import Target, pull
 from geomocap.tracking.deformation import block_pattern, step
@@ -92,8 +93,13 @@ class NodeModel:
         where = cKDTree(carried.samples).query(self.graph.nodes)[1]
         self.carrier, self.carrier_weights = carried.binding[where], carried.weights[where]
 
-    def refine(self, target: Target, coarse: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Fit the fine graph to a frame from the coarse graph's state; positions, rotations, covariances."""
+    def refine(
+        self, target: Target, coarse: State, homes: np.ndarray, anchors: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Fit the fine graph to a frame from the coarse graph's state; positions, rotations, covariances.
+
+        `homes` and `anchors` (P, 3) are where points are in the reference frame and in this one, NaN where not known.
+        """
         arm = self.graph.nodes[:, None] - self.coarse.graph.nodes[self.carrier]
         moved = coarse.x[self.carrier] + np.matmul(coarse.R[self.carrier], arm[..., None])[..., 0]
         w = self.carrier_weights
@@ -101,19 +107,22 @@ class NodeModel:
         R = _nearest_rotations((w[..., None, None] * coarse.R[self.carrier]).sum(axis=1))
         h, s, g = self.graph.spacing, self.settings, self.graph
         target = replace(target, points=target.points.turned_like(*g.deform(x, R), 0.5 * h))
+        marks = Marks.of(g, homes, anchors)
         for scale, stiffness in FINE:
             c = max(scale * h, 1.5 * self.spacing)
             y, normals = g.deform(x, R)
             tree = cKDTree(target.coordinates(c))
             found = pull(target, tree, y, normals, g.features, c, s.point_weight, s.feature_weight)
+            marks.add_to(found.A, found.b, g, x, R, s.anchor_weight, c)
             soft = 1 / (1 + (g.strain(x, R) / s.give) ** 2) ** 2
             share = len(g.samples) / len(g.nodes) / 4
             x, R = step(g, self.pattern, x, R, stiffness * s.fine_stiffness * share * soft, found.A, found.b, 60)
         y, normals = g.deform(x, R)
         tree = cKDTree(target.coordinates(c))
         found = pull(target, tree, y, normals, g.features, c, s.point_weight, 0.0)
+        anchored = np.bincount(marks.sample, minlength=len(y)).astype(float)
         covariance, support = node_covariance(
-            self.patches, normals, found.support, found.across, s.slide * h, s.noise * h
+            self.patches, normals, found.support, found.across, s.slide * h, s.noise * h, anchored
         )
         return np.where((support >= s.lost_below)[:, None], x, np.nan), R, covariance
 
@@ -131,6 +140,7 @@ def track_nodes(
     features: Points | None = None,
     progress: Progress = silent,
     executor: Executor | None = None,
+    anchors: np.ndarray | None = None,
 ) -> NodeTracks:
     """Follow nodes of a surface through all frames, forwards and backwards from the most open one.
 
@@ -145,6 +155,9 @@ def track_nodes(
     progress : callable, optional
     executor : Executor, optional
         Threads; the cores' number of them if not given.
+    anchors : (P, T, 3) float, metres, optional
+        Trajectories of points of the surface that are known from elsewhere, NaN where they are not: nodes near them do
+        not slide.
 
     Raises
     ------
@@ -156,7 +169,7 @@ def track_nodes(
         raise GeometryError("nodes can't be tracked through a sequence without frames")
     if executor is None:
         with threads() as own:
-            return track_nodes(points, n_frames, settings, features, progress, own)
+            return track_nodes(points, n_frames, settings, features, progress, own, anchors)
 
     def prepare(frame: int) -> PointSet:
         more = None if features is None else features(frame)
@@ -186,15 +199,19 @@ def track_nodes(
         )
 
     coarse = list(map_items(coarsen, list(range(n_frames)), executor, "ends of limbs", progress))
-    ahead, back = map_items(
-        lambda way: follow(model.coarse, coarse, reference, way), [1, -1], executor, "coarse motion", progress
+    known = np.zeros((0, n_frames, 3)) if anchors is None else np.asarray(anchors, float)
+    (ahead, homes_ahead), (back, homes_back) = map_items(
+        lambda way: follow(model.coarse, coarse, reference, way, known), [1, -1], executor, "coarse motion", progress
     )
     states = back[:0:-1] + ahead
+    homes = [homes_back if frame < reference else homes_ahead for frame in range(n_frames)]
+    marked = [model.coarse.marked(coarse[k], homes[k], known[:, k]) for k in range(n_frames)]
     for way in (-1, 1):
-        states = mend(model.coarse, coarse, states, reference, way)
+        states = mend(model.coarse, marked, states, reference, way)
 
     def refine(frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return model.refine(Target(frames[frame], scales, settings.normal_weight), states[frame])
+        target = Target(frames[frame], scales, settings.normal_weight)
+        return model.refine(target, states[frame], homes[frame], known[:, frame])
 
     fine = list(map_items(refine, list(range(n_frames)), executor, "nodes", progress))
     x, R, covariance = (np.stack([f[k] for f in fine], axis=1) for k in range(3))

@@ -27,7 +27,13 @@ def patch_mean(graph: NodeGraph, rounds: int = 2) -> csr_matrix:
 
 
 def node_covariance(
-    mean: csr_matrix, normals: np.ndarray, weight: np.ndarray, across: np.ndarray, slide: float, floor: float
+    mean: csr_matrix,
+    normals: np.ndarray,
+    weight: np.ndarray,
+    across: np.ndarray,
+    slide: float,
+    floor: float,
+    anchored: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Covariance of each node's position (N, 3, 3), m², and the support of its patch (N,), 0 to 1.
 
@@ -46,9 +52,13 @@ def node_covariance(
         Distance of each sample to the plane of its point, metres.
     slide, floor : float
         Standard deviation of an unseen sliding, and the least of any direction, metres.
+    anchored : (S,) float, optional
+        Number of anchors at each sample; they hold it in all directions.
     """
     support = mean @ weight
     held = mean @ (weight[:, None] * (normals[:, :, None] * normals[:, None, :]).reshape(-1, 9))
     variance = (mean @ (weight * across**2)) / np.maximum(support, 1e-6) + floor**2
     information = held.reshape(-1, 3, 3) / variance[:, None, None] + np.eye(3) / slide**2
+    if anchored is not None:
+        information += (mean @ anchored / variance)[:, None, None] * np.eye(3)
     return np.linalg.inv(information), support

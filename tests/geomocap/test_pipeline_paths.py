@@ -69,8 +69,16 @@ def test_patches_where_they_cover_the_subject(job):
     assert motion_paths(job("auto", trajectories(500, 1.0)), Ball())[1] == "patches"
 
 
-def test_nodes_where_there_are_too_few_patches(job):
-    assert motion_paths(job("auto", trajectories(100, 1.0)), Ball())[1] == "nodes"
+def test_both_where_there_are_too_few_patches(job):
+    assert motion_paths(job("auto", trajectories(100, 1.0)), Ball())[1] == "both"
+
+
+def test_nodes_without_patches(job):
+    assert motion_paths(job("auto"), Ball())[1] == "nodes"
+
+
+def test_both_although_patches_cover_the_subject(job):
+    assert motion_paths(job("both", trajectories(500, 1.0)), Ball())[1] == "both"
 
 
 def test_few_patches_where_they_are_asked_for(job):
