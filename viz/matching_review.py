@@ -125,7 +125,7 @@ def shifts_picture(image: np.ndarray, surface: SurfaceMatches, search: int = 0, 
     way = np.linalg.norm(surface.matches.positions[seen, search] - surface.grid.pixels[seen], axis=1)
     low, high = (float(v) for v in np.quantile(way, [0.02, 0.98])) if len(way) else (0.0, 1.0)
     colors = scale_colors((way - low) / max(high - low, 1e-9))
-    size = max(1, round(0.75 * scale))
+    size = max(1, int(np.ceil(0.6 * scale * surface.grid.step)))
     for (x, y), color in zip(place(surface.grid.pixels[seen]), colors.tolist(), strict=True):
         cv2.circle(canvas, (x, y), size, color, -1)
     return _captioned(canvas, ((f"shift {low:.1f} px", _LOW), (f"to {high:.1f} px", _HIGH)))

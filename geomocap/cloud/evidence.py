@@ -43,7 +43,8 @@ class Evidence:
 
     def doubt(self, trust: TrustSettings) -> str:
         """Say why none of the matches is to be trusted; empty if they are."""
-        worst = float(np.nanmax(self.residuals)) if np.isfinite(self.residuals).any() else 0.0
+        known = self.residuals[~np.isnan(self.residuals)]
+        worst = float(known.max(initial=0.0))
         if self.growth < trust.growth:
             return "matches do not spread from their seeds"
         if worst > trust.residual:

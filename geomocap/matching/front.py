@@ -157,7 +157,7 @@ class Front:
             )
         finally:
             numba.set_num_threads(threads)
-        self.tries[targets] += ~self.matched[targets]
+        self.tries[targets] += self.planes[targets, gk.IMAGES] == 0
 
     # --- orders ---
 

@@ -13,8 +13,9 @@ from scipy.spatial import cKDTree
 from geomocap.cameras import Rig
 from geomocap.cloud import CloudFrame, CloudSettings, cloud_of_frame, match_groups
 from geomocap.cloud.bounds import box_depth, hull_depth, inside_silhouettes
+from geomocap.cloud.evidence import Evidence
 from geomocap.cloud.groups import scene_center
-from geomocap.cloud.settings import GroupSettings
+from geomocap.cloud.settings import GroupSettings, TrustSettings
 from geomocap.errors import CalibrationError, GeometryError
 from geomocap.geometry import Voxels
 from tests.geomocap.ball import (
@@ -348,3 +349,28 @@ def test_parallel_axes_have_a_scene_too() -> None:
     assert np.mean(off_surface(frame.points.positions) < 0.02) > 0.98
     middle = match_groups(stereo, box=((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))).groups[0].depth
     assert middle == pytest.approx(float(-stereo.centers[0] @ stereo.viewing_directions[0]))
+
+
+@pytest.mark.parametrize(
+    ("residuals", "growth", "removed", "confirmed", "words"),
+    [
+        ([0.03, 0.05], 1.2, 0.02, 0.6, ""),
+        ([0.03, np.nan], 1.2, 0.1, 0.0, ""),
+        ([0.5], 1.2, 0.1, np.nan, ""),
+        ([0.03, 0.05], 0.05, 0.02, 0.6, "spread"),
+        ([0.03, 0.9], 1.2, 0.02, 0.6, "by 0.90 px"),
+        ([0.03, np.inf], 1.2, 0.02, 0.6, "leave their epipolar lines"),
+        ([np.inf], 1.2, 0.02, np.nan, "leave their epipolar lines"),
+        ([0.3, np.nan], 1.2, 0.02, 0.0, "by 0.30 px and no third image"),
+        ([0.03], 1.2, 0.4, np.nan, "40% of the matches"),
+    ],
+)
+def test_evidence(residuals: list[float], growth: float, removed: float, confirmed: float, words: str) -> None:
+    doubt = Evidence(np.array(residuals), growth, removed, confirmed).doubt(TrustSettings())
+    assert words in doubt and bool(doubt) == bool(words)
+
+
+def test_right_calibration_leaves_no_residuals(sharp: CloudFrame) -> None:
+    evidence = sharp.templates[0].evidence
+    assert (evidence.residuals < 0.1).all() and evidence.growth > 0.5
+    assert evidence.removed < 0.05 and evidence.confirmed > 0.7

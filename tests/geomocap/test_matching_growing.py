@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from geomocap.matching import grow_kernel as gk
 from geomocap.matching.epipolar import transfers
 from geomocap.matching.grid import Grid
 from geomocap.matching.growing import consistent, regions
@@ -108,3 +109,27 @@ def test_no_seeds_outside_the_depth_range() -> None:
     nowhere = DepthRange.constant(grey[1].shape, np.nan, np.nan)
     found = find_seeds(grey[1], masks[1], smooth, transfers(rig, 1, [0, 2]), nowhere, 420.0)
     assert len(found) == 0 and set(found.reasons) == {"seed without depth range"}
+
+
+def test_best_neighbours_as_written_out() -> None:
+    rng = np.random.default_rng(0)
+    grid = Grid.over((30, 40), 2.0, rng.random((30, 40)) < 0.9)
+    n = len(grid)
+    planes = np.zeros((n, gk.PLANE))
+    planes[:, gk.IMAGES] = rng.integers(0, 3, n)
+    planes[:, gk.KEY] = rng.random(n)
+    tries, last = rng.integers(0, 4, n), rng.integers(-1, n, n)
+    source, key = np.full(n, -7, np.int64), np.zeros(n)
+    # Some cells were last tried from their best neighbour, and are left alone
+    gk.best_neighbours(grid.neighbours, planes, tries, 3, last, source, key)
+    again = source >= 0
+    last[again & (np.arange(n) % 3 == 0)] = source[again & (np.arange(n) % 3 == 0)]
+    gk.best_neighbours(grid.neighbours, planes, tries, 3, last, source, key)
+    for cell in range(n):
+        around = [m for m in grid.neighbours[cell, :4] if m >= 0 and planes[m, gk.IMAGES] > 0]
+        best = max(around, key=lambda m: planes[m, gk.KEY], default=-1)
+        if planes[cell, gk.IMAGES] > 0 or tries[cell] >= 3 or best == last[cell]:
+            best = -1
+        assert source[cell] == best
+        assert best < 0 or key[cell] == planes[best, gk.KEY]
+    assert 0 < (source >= 0).sum() < n
