@@ -9,6 +9,7 @@ from typing import Any
 from pydantic import Field
 
 from geomocap.articulation.refinement import RefinementSettings
+from geomocap.articulation.take_tracking import TakeSettings
 from geomocap.carving.settings import CarvingSettings
 from geomocap.cloud.settings import CloudSettings
 from geomocap.errors import SettingsError
@@ -42,6 +43,7 @@ class Config(Settings):
     motion_bodies: MotionBodiesSettings = Field(MotionBodiesSettings(), description="bodies from motion paths")
     motion_skeleton: MotionSkeletonSettings = Field(MotionSkeletonSettings(), description="their joints")
     refinement: RefinementSettings = Field(RefinementSettings(), description="refinement of their motion")
+    take: TakeSettings = Field(TakeSettings(), description="following a subject's model through another take")
     export: ExportSettings = Field(ExportSettings(), description="motion files")
 
 

@@ -14,7 +14,7 @@ from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_bande
 from geomocap.articulation.kinematics import BodyMotion, JointMotion, Linkage, body_motion, moved_by
 from geomocap.articulation.normal_kernel import normal_equations
 from geomocap.articulation.observations import Observations, SkinPoints
-from geomocap.articulation.smoothness import Smoothness, prior_terms
+from geomocap.articulation.smoothness import PosePrior, Smoothness, pose_terms, prior_terms
 
 _CHUNK = 64  # frames whose blocks are in memory at once
 _LEAST_DAMPING = 1e-6
@@ -63,6 +63,7 @@ def adjust(
     observations: Observations,
     *,
     smoothness: Smoothness | None = None,
+    pose_prior: PosePrior | None = None,
     joint_prior: JointPrior | None = None,
     cutoff: float = 3.0,
     rounds: int = 10,
@@ -78,6 +79,8 @@ def adjust(
     observations : Observations
     smoothness : Smoothness, optional
         Temporal prior; without it every frame is by itself.
+    pose_prior : PosePrior, optional
+        What is expected of each frame.
     joint_prior : JointPrior, optional
         Joints are unknowns, too; without it they stay.
     cutoff : float
@@ -88,14 +91,15 @@ def adjust(
         Stop when a step lowers the cost by a smaller share.
     """
     damping = 1e-4
-    system = _system(linkage, motion, points, observations, smoothness, joint_prior, cutoff)
+    priors = (smoothness, pose_prior, joint_prior)
+    system = _system(linkage, motion, points, observations, priors, cutoff)
     for _ in range(rounds):
         improved = False
         while damping <= _MOST_DAMPING:
             step, shift = system.solve(damping)
             trial = moved_by(linkage, motion, step)
             bent = replace(linkage, joints=linkage.joints + shift) if joint_prior is not None else linkage
-            attempt = _system(bent, trial, points, observations, smoothness, joint_prior, cutoff)
+            attempt = _system(bent, trial, points, observations, priors, cutoff)
             if attempt.cost < system.cost:
                 improved = True
                 break
@@ -171,10 +175,10 @@ def _system(
     motion: JointMotion,
     points: SkinPoints,
     observations: Observations,
-    smoothness: Smoothness | None,
-    joint_prior: JointPrior | None,
+    priors: tuple[Smoothness | None, PosePrior | None, JointPrior | None],
     cutoff: float,
 ) -> _System:
+    smoothness, pose_prior, joint_prior = priors
     bodies = body_motion(linkage, motion)
     size = int(linkage.joint_dof[-1])
     shared = 3 * len(linkage.joints) if joint_prior is not None else 0
@@ -216,6 +220,11 @@ def _system(
         right[1:-1] += 2.0 * push
         right[2:] -= push
         cost += prior_cost
+    if pose_prior is not None:
+        weights, away, pose_cost = pose_terms(linkage, motion, pose_prior)
+        blocks[:, np.arange(size), np.arange(size)] += weights
+        right -= weights * away
+        cost += pose_cost
     if joint_prior is not None:
         weight = joint_prior.sigma**-2
         apart = linkage.joints - joint_prior.joints

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from geomocap.articulation.kinematics import Linkage
+from geomocap.articulation.kinematics import BodyMotion, Linkage, posed
 from geomocap.articulation.observations import SkinPoints
 from geomocap.errors import GeometryError
 from geomocap.skeleton.hierarchy import Hierarchy
@@ -127,10 +128,34 @@ class SubjectModel:
         """The surface with its weights."""
         return SkinPoints(self.points, self.skin_bodies, self.skin_shares)
 
+    def reposed(self, bodies: BodyMotion, frame: int) -> SubjectModel:
+        """Return the model with the pose of a frame of a motion as its rest pose."""
+        rotations = bodies.rotations[frame]
+        linkage, parents = posed(self.linkage, bodies, frame), self.linkage.hierarchy.parents
+        before = np.where((parents >= 0)[:, None, None], rotations[parents], np.eye(3))
+        poses = np.einsum("bij,kbjl,bml->kbim", before, self.poses, rotations)
+        one = bodies.part(slice(frame, frame + 1))
+        return replace(
+            self,
+            points=one.carry(self.points, self.skin_bodies, self.skin_shares)[0],
+            normals=np.einsum("pij,pj->pi", rotations[self.skin.body], self.normals),
+            joints=linkage.joints,
+            joint_axes=linkage.axes,
+            joint_limits=rotation_limits(poses[:, self.joint_bodies[:, 1]]),
+            origin=linkage.origin,
+            poses=poses,
+        )
+
     def arrays(self) -> dict[str, Any]:
         """Return the arrays of `model.npz`."""
         values = {name: np.asarray(getattr(self, name)) for name in self.__dataclass_fields__}
         return {"kind": np.array(KIND), "version": np.array(VERSION), **values}
+
+
+def rotation_limits(rotations: np.ndarray) -> np.ndarray:
+    """Least and largest components of rotation vectors, (J, 2, 3) radians, of rotations (T, J, 3, 3)."""
+    vectors = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec().reshape(*rotations.shape[:2], 3)
+    return np.stack([vectors.min(axis=0), vectors.max(axis=0)], axis=1)
 
 
 def read_model(path: Path) -> SubjectModel:

@@ -7,16 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from geomocap.articulation.kinematics import BodyMotion
-from geomocap.articulation.model import SubjectModel
+from geomocap.articulation.model import SubjectModel, rotation_limits
 from geomocap.articulation.observations import INFLUENCES, SkinPoints
 from geomocap.errors import GeometryError
 from geomocap.export.surface import shell_normals
 from geomocap.segmentation.motion_bodies import MotionBodies
 from geomocap.skeleton.motion_skeleton import MotionSkeleton
-from geomocap.skeleton.skeleton import Skeleton
 
 FRAMES = 12  # that have a say in the surface
 AGREEING = 0.5  # share of the frames that must show a point
@@ -90,7 +88,7 @@ def build_model(
         skeleton.joint_bodies,
         np.array([joint.axis for joint in found.joints]).reshape(-1, 3),
         hinge,
-        joint_limits(skeleton),
+        rotation_limits(skeleton.local_rotations[:, skeleton.joint_bodies[:, 1]]),
         skeleton.joint_names,
         skeleton.body_names,
         skeleton.root,
@@ -165,15 +163,6 @@ def _extents(points: np.ndarray) -> np.ndarray:
         return np.zeros(3)
     away = points - points.mean(axis=0)
     return np.ptp(away @ np.linalg.eigh(away.T @ away)[1][:, ::-1], axis=0)
-
-
-def joint_limits(skeleton: Skeleton) -> np.ndarray:
-    """Least and largest components of each joint's rotation vectors, (J, 2, 3) radians, in the parent's axes."""
-    limits = np.zeros((len(skeleton.joint_bodies), 2, 3))
-    for j, child in enumerate(skeleton.joint_bodies[:, 1]):
-        vectors = Rotation.from_matrix(skeleton.local_rotations[:, child]).as_rotvec()
-        limits[j] = vectors.min(axis=0), vectors.max(axis=0)
-    return limits
 
 
 def key_poses(local: np.ndarray, count: int = KEY_POSES) -> np.ndarray:

@@ -31,6 +31,41 @@ class Smoothness:
     cutoff: float
 
 
+@dataclass(frozen=True)
+class PosePrior:
+    """A motion that is expected, each frame by itself: a prediction, or poses seen before.
+
+    Attributes
+    ----------
+    motion : JointMotion
+    turn : float, radians
+        Standard deviation of each joint's turn from what is expected.
+    root_turn : float, radians
+    shift : float, metres
+        Of the root's place.
+    """
+
+    motion: JointMotion
+    turn: float
+    root_turn: float
+    shift: float
+
+
+def pose_terms(linkage: Linkage, motion: JointMotion, prior: PosePrior) -> tuple[np.ndarray, np.ndarray, float]:
+    """Weights (D,) and values (T, D) of the turns and shifts from the expected motion, and their cost."""
+    first = linkage.joint_dof
+    value = np.empty((motion.frames, first[-1]))
+    root = linkage.hierarchy.root
+    away = motion.local @ prior.motion.local.swapaxes(-1, -2)
+    vectors = Rotation.from_matrix(away.reshape(-1, 3, 3)).as_rotvec().reshape(*away.shape[:2], 3)
+    value[:, :3], value[:, 3:6] = vectors[:, root], motion.root - prior.motion.root
+    for j, child in enumerate(linkage.hierarchy.joint_bodies[:, 1]):
+        turn = vectors[:, child]
+        value[:, first[j] : first[j + 1]] = (turn @ linkage.axes[j])[:, None] if linkage.hinge[j] else turn
+    sigma = np.repeat([prior.root_turn, prior.shift, prior.turn], [3, 3, first[-1] - 6])
+    return sigma**-2, value, float(0.5 * ((value / sigma) ** 2).sum())
+
+
 def accelerations(linkage: Linkage, motion: JointMotion) -> np.ndarray:
     """Second differences of all degrees of freedom, (T - 2, D): of turns on SO(3), in the parent's axes.
 

@@ -52,7 +52,13 @@ def options(
 
 
 Fps = Annotated[float, typer.Option("--fps", min=0.001, help="Scans per second.")]
-BODIES = ("segmentation", "skeleton", "nodes", "motion_bodies", "motion_skeleton", "refinement")
+BODIES = ("segmentation", "skeleton", "nodes", "motion_bodies", "motion_skeleton", "refinement", "take")
+ModelFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--model", metavar="FILE.npz", help="Model of the subject, model.npz of another run: it is followed instead."
+    ),
+]
 Pictures = Annotated[bool, typer.Option(help="Make review pictures and the report.")]
 
 
@@ -106,12 +112,13 @@ def segment(
     run: RunFolder,
     config: Config,
     fps: Fps = 30.0,
+    model: ModelFile = None,
     pictures: Pictures = True,
     workers: Workers = None,
     scheduler: Scheduler = None,
 ) -> None:
     """Segment any sequence of scans into rigid bodies, joints and motion; one scan gets its ellipsoids."""
-    with scans_job(scans, run, fps, config, workers, scheduler) as job:
+    with scans_job(scans, run, fps, config, workers, scheduler, model) as job:
         key = pipeline.motion_files(job, "scans")
         if pictures:
             review_job(job, key)
@@ -125,6 +132,7 @@ def run(
     run: RunFolder,
     config: Config,
     source: Annotated[Literal["voxels", "cloud"], typer.Option("--source", help="Geometry to work from.")] = "voxels",
+    model: ModelFile = None,
     pictures: Pictures = True,
     workers: Workers = None,
     scheduler: Scheduler = None,
@@ -133,9 +141,12 @@ def run(
 
     A run that was stopped goes on where it was; stages whose inputs and settings have not changed are not done again.
 
+    With a model of the subject, saved as model.npz by a run of another take, bodies and joints are not looked for: the
+    model is found in this take and followed through it.
+
     Example: `geomocap run CAPTURE RUN --carving.resolution 192`
     """
-    with capture_job(capture, run, config, workers, scheduler) as job:
+    with capture_job(capture, run, config, workers, scheduler, model) as job:
         key = pipeline.motion_files(job, source)
         if pictures:
             review_job(job, key)

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from geomocap.articulation.model import MODEL_FILE, read_model
 from geomocap.capture import Capture
 from geomocap.cli.execution import executor_for
 from geomocap.cli.progress import progress_bars
@@ -23,27 +24,46 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder; made
 
 
 @contextmanager
-def capture_job(capture: Path, run: Path, config: Config, workers: int | None, scheduler: str | None) -> Iterator[Job]:
-    """Make the job of a capture."""
+def capture_job(
+    capture: Path, run: Path, config: Config, workers: int | None, scheduler: str | None, model: Path | None = None
+) -> Iterator[Job]:
+    """Make the job of a capture, with the subject's model if there is one."""
     opened = Capture.open(capture)
     _check_apart(capture, run)
+    _check_model(model, run)
     with executor_for(workers, scheduler) as executor, progress_bars() as progress:
-        job = Job(Run(run), config, executor, progress, capture=opened, fps=opened.fps)
+        job = Job(Run(run), config, executor, progress, capture=opened, fps=opened.fps, model=model)
         job.write_record()
         yield job
 
 
 @contextmanager
 def scans_job(
-    scans: Path, run: Path, fps: float, config: Config, workers: int | None, scheduler: str | None
+    scans: Path,
+    run: Path,
+    fps: float,
+    config: Config,
+    workers: int | None,
+    scheduler: str | None,
+    model: Path | None = None,
 ) -> Iterator[Job]:
-    """Make the job of a sequence of scans."""
+    """Make the job of a sequence of scans, with the subject's model if there is one."""
     opened = open_scans(scans, config.scans)
     _check_apart(scans, run)
+    _check_model(model, run)
     with executor_for(workers, scheduler) as executor, progress_bars() as progress:
-        job = Job(Run(run), config, executor, progress, scans=opened, fps=fps)
+        job = Job(Run(run), config, executor, progress, scans=opened, fps=fps, model=model)
         job.write_record()
         yield job
+
+
+def _check_model(model: Path | None, run: Path) -> None:
+    """A model is read before long work begins; that of the run itself would be overwritten."""
+    if model is None:
+        return
+    read_model(model)
+    if model.resolve() == (run / MODEL_FILE).resolve():
+        raise RunError(f"{model}: is the model of this very run; choose another folder for the take")
 
 
 def _check_apart(source: Path, run: Path) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from importlib.metadata import version
+from pathlib import Path
 
 import geomocap
 from geomocap.capture import Capture
@@ -32,6 +33,8 @@ class Job:
         Geometry that takes the place of a capture.
     fps : float
         Frames per second.
+    model : Path, optional
+        `model.npz` of the subject, from another take.
     """
 
     run: Run
@@ -41,6 +44,7 @@ class Job:
     capture: Capture | None = None
     scans: Scans | None = None
     fps: float = 30.0
+    model: Path | None = None
 
     def stage(
         self, name: str, key: str, outputs: Sequence[str], work: Callable[[], int], optional: Sequence[str] = ()
@@ -69,12 +73,13 @@ class Job:
         source = (
             self.capture.path if self.capture is not None else self.scans.source if self.scans is not None else None
         )
+        model = {} if self.model is None else {"model": str(self.model)}
         kind = "capture" if self.capture is not None else "scans"
         packages = ("numpy", "scipy", "numba", "open3d", "opencv-python-headless", "pycolmap", "trimesh")
         self.run.write_record(
             {
                 "geomocap": {"version": geomocap.__version__},
-                "source": {"kind": kind, "path": str(source), "fps": self.fps, "up": self.up},
+                "source": {"kind": kind, "path": str(source), "fps": self.fps, "up": self.up, **model},
                 "versions": {"python": platform.python_version(), **{p: version(p) for p in packages}},
                 "config": self.config.model_dump(mode="json", exclude_none=True),
             }

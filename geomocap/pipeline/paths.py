@@ -31,7 +31,7 @@ def motion_paths(job: Job, geometry: Geometry) -> tuple[MotionPaths, str]:
     if wanted != "nodes" and (job.run.path / "tracks.npz").exists():
         tracked = job.run.read_npz("tracks.npz")
     if tracked is not None and wanted != "both":
-        paths = _patches(tracked)
+        paths = patch_paths(tracked)
         if paths is not None and (wanted == "patches" or _covers(paths)):
             return paths, "patches"
     if wanted == "patches":
@@ -44,7 +44,7 @@ def motion_paths(job: Job, geometry: Geometry) -> tuple[MotionPaths, str]:
     return nodes.motion_paths(), "nodes" if anchors is None else "both"
 
 
-def _patches(tracked: dict[str, np.ndarray]) -> MotionPaths | None:
+def patch_paths(tracked: dict[str, np.ndarray]) -> MotionPaths | None:
     """Long trajectories, evenly over the surface; None: there are none."""
     chosen = spread_out(tracked["positions"], SAMPLES)
     if not len(chosen):

@@ -11,6 +11,7 @@ from geomocap.pipeline.clouds import bounds_of
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.motion import segment_by_motion
 from geomocap.pipeline.sources import Source, geometry_of
+from geomocap.pipeline.take import segment_with_model
 from geomocap.pipeline.tracks import tracks
 from geomocap.pipeline.warnings import WARNINGS_FILE
 from geomocap.run import Run, stage_key
@@ -24,6 +25,8 @@ def segment(job: Job, source: Source) -> str:
     """Find ellipsoids, bodies and skeleton; return the stage's key."""
     geometry, source_key = geometry_of(job, source)
     config = job.config
+    if job.model is not None:
+        return segment_with_model(job, geometry, source_key)
     by_motion = config.segmentation.method == "motion" and len(geometry) > 1
     settings: dict[str, Any] = {"segmentation": config.segmentation.model_dump()}
     if by_motion:

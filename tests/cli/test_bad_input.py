@@ -139,3 +139,17 @@ def test_no_dask_scheduler(capture, geomocap, tmp_path):
 def test_pycolmap_is_the_tested_version():
     """Models of another version may read differently; the bounds of pyproject.toml keep to this one."""
     assert pycolmap.__version__.startswith("4.2")
+
+
+@pytest.mark.parametrize("name", ["missing.npz", "damaged.npz"])
+def test_bad_model(capture, geomocap, tmp_path, name):
+    (tmp_path / "damaged.npz").write_bytes(b"no model at all")
+    line = refused(geomocap("run", capture, tmp_path / "run", "--model", tmp_path / name, check=False))
+    assert name in line and "model" in line
+
+
+def test_model_of_the_run_itself(capture, geomocap, tmp_path, monkeypatch):
+    (tmp_path / "run").mkdir()
+    monkeypatch.setattr("geomocap.cli.jobs.read_model", lambda path: None)
+    model = tmp_path / "run" / "model.npz"
+    assert "another folder" in refused(geomocap("run", capture, tmp_path / "run", "--model", model, check=False))

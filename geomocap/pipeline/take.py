@@ -1,0 +1,125 @@
+"""Another take of a known subject: its model instead of bodies and joints found anew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from geomocap.articulation.kinematics import BodyMotion, posed, since
+from geomocap.articulation.model import MODEL_FILE, SubjectModel, read_model
+from geomocap.articulation.take_tracking import TrackedTake, track_take
+from geomocap.files import fingerprint
+from geomocap.geometry import BodyPoints, Geometry
+from geomocap.pipeline.job import Job
+from geomocap.pipeline.paths import patch_paths
+from geomocap.pipeline.tracks import tracks
+from geomocap.pipeline.warnings import WARNINGS_FILE, write_warnings
+from geomocap.run import Run, stage_key
+from geomocap.scheduling import map_items
+from geomocap.segmentation.ellipsoids import Ellipsoids, fit_ellipsoids
+from geomocap.skeleton.motion_skeleton import skeleton_of_motion
+from geomocap.skeleton.skeleton import Skeleton
+
+_AXES: dict[str, int] = {"x": 0, "y": 1, "z": 2}
+
+
+def segment_with_model(job: Job, geometry: Geometry, source_key: str) -> str:
+    """Follow the job's model, write what a segmentation writes, and return the stage's key."""
+    assert job.model is not None
+    model = read_model(job.model)
+    patches = None
+    if job.capture is not None and job.config.segmentation.paths != "nodes":
+        patches = tracks(job)
+    key = stage_key(
+        "take", source_key, patches, fingerprint([job.model]), job.config.take.model_dump(), job.fps, job.up
+    )
+    outputs = ["ellipsoids.npz", "bodies", "diagnostics.npz", "skeleton.npz", MODEL_FILE]
+    work = partial(_follow, job, geometry, model, patches is not None)
+    return job.stage("segmentation", key, outputs, work, [WARNINGS_FILE])
+
+
+def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) -> int:
+    frames = len(geometry)
+    features = geometry.features if len(model.colors) else None
+
+    def read(frame: int) -> tuple[np.ndarray, np.ndarray | None]:
+        return geometry.points(frame), None if features is None else features(frame)
+
+    with job.run.timed("model") as count:
+        take = track_take(
+            model,
+            read,
+            frames,
+            geometry.spacing,
+            _AXES[job.up],
+            patch_paths(job.run.read_npz("tracks.npz")) if patches else None,
+            job.config.take,
+            job.progress,
+        )
+        count["items"] = frames
+    label = _Label(geometry, job.run, model, take.bodies)
+    fitted = list(map_items(label, range(frames), job.executor, "labels", job.progress))
+    names = ("centers", "radii", "rotations", "counts", "errors")
+    together = {name: np.stack([getattr(e, name) for e in fitted]) for name in names}
+    job.run.write_npz("ellipsoids.npz", **together, body=np.arange(model.body_count, dtype=np.int32))
+    job.run.write_npz("skeleton.npz", **_skeleton(model, take, job.fps).arrays())
+    job.run.write_npz(MODEL_FILE, **model.reposed(take.bodies, 0).arrays())
+    job.run.write_npz(
+        "diagnostics.npz",
+        paths=np.array("model"),
+        fit_distance=take.distance,
+        first_frame=take.first_frame,
+        joint_is_hinge=model.joint_hinge,
+        joint_axes=model.joint_axes,
+    )
+    write_warnings(job.run, _fit_warnings(model, take, job.config.take.poor_fit))
+    return frames
+
+
+def _skeleton(model: SubjectModel, take: TrackedTake, fps: float) -> Skeleton:
+    linkage, motion = posed(model.linkage, take.bodies, 0), since(take.bodies, 0)
+    start = take.bodies.part(slice(0, 1)).carry(model.points, model.skin_bodies, model.skin_shares)[0]
+    owners = model.skin.body
+    own = linkage.hierarchy.body_joints
+    places = [start[owners == b] for b in range(model.body_count)]
+    middle = np.stack([p.mean(axis=0) if len(p) else linkage.joints[own[b]] for b, p in enumerate(places)])
+    centers = np.einsum("tbij,bj->tbi", motion.rotations, middle) + motion.translations
+    joints = linkage.joint_positions(motion)
+    found = skeleton_of_motion(linkage.hierarchy, linkage.joints, motion.rotations, joints, centers, middle, fps)
+    return replace(found, joint_names=model.joint_names, body_names=model.body_names)
+
+
+def _fit_warnings(model: SubjectModel, take: TrackedTake, poor: float) -> list[str]:
+    share = take.distance / model.extent
+    if float(np.median(share)) > poor:
+        return [
+            f"The model fits this take poorly: their surfaces are {1000 * np.median(take.distance):.0f} mm apart "
+            f"({100 * np.median(share):.1f} % of its extent; up to {100 * poor:g} % is usual). Is it the same subject, "
+            "at the same scale?"
+        ]
+    bad = np.flatnonzero(share > poor)
+    if len(bad):
+        listed = ", ".join(str(t) for t in bad[:5]) + (" …" if len(bad) > 5 else "")
+        return [f"The model fits poorly in {len(bad)} of {len(share)} frames ({listed}); look at these."]
+    return []
+
+
+@dataclass(frozen=True)
+class _Label:
+    """Bodies of the points of one frame, written to the run, and an ellipsoid for each."""
+
+    geometry: Geometry
+    run: Run
+    model: SubjectModel
+    bodies: BodyMotion
+
+    def __call__(self, frame: int) -> Ellipsoids:
+        points = self.geometry.points(frame)
+        skin = self.model.skin
+        placed = self.bodies.part(slice(frame, frame + 1)).carry(skin.rest, skin.bodies, skin.shares)[0]
+        label = skin.body[cKDTree(placed).query(points)[1]].astype(np.int32)
+        BodyPoints(points, label).write(self.run.frame_file("bodies", frame))
+        return fit_ellipsoids(points, label, self.model.body_count, self.geometry.spacing)

@@ -1,0 +1,189 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from geomocap.articulation.adjustment import adjust
+from geomocap.articulation.kinematics import BodyMotion, JointMotion, body_motion, posed, since
+from geomocap.articulation.model import SubjectModel, rotation_limits
+from geomocap.articulation.observations import Observations
+from geomocap.articulation.smoothness import PosePrior
+from geomocap.articulation.surface_matching import FrameSurface, MatchingScales, ModelSurface, match_surfaces
+from geomocap.articulation.take_tracking import TakeSettings, attach_paths, track_take
+from geomocap.config import Config
+from geomocap.errors import GeometryError
+from geomocap.pipeline.job import Job
+from geomocap.pipeline.segmentation import segment
+from geomocap.run import Run
+from geomocap.scans import open_scans
+from geomocap.scheduling import threads
+from geomocap.segmentation.motion_paths import MotionPaths
+from geomocap.segmentation.rigid_motions import turn_angles
+
+SPACING = 0.015
+
+
+def box(low, high):
+    """Grid points on the surface of a box."""
+    axes = [np.linspace(a, b, max(2, round((b - a) / SPACING) + 1)) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    return grid[((grid == np.array(low)) | (grid == np.array(high))).any(axis=1)]
+
+
+def outward(points, low, high):
+    """Normals of points on a box."""
+    scaled = (points - (np.array(low) + high) / 2) / ((np.array(high) - low) / 2)
+    face = np.abs(scaled).argmax(axis=1)
+    normals = np.zeros_like(points)
+    normals[np.arange(len(points)), face] = np.sign(scaled[np.arange(len(points)), face])
+    return normals
+
+
+@pytest.fixture(scope="module")
+def model():
+    """A trunk standing on its end, with an arm to one side and a neck that leans, all of other sizes."""
+    sizes = [
+        ([-0.12, -0.08, 0.0], [0.12, 0.08, 0.6]),
+        ([0.12, -0.05, 0.45], [0.55, 0.05, 0.55]),
+        ([-0.05, -0.05, 0.6], [0.05, 0.15, 0.8]),
+    ]
+    parts = [box(*s) for s in sizes]
+    points = np.concatenate(parts)
+    body = np.repeat(np.arange(3), [len(p) for p in parts])
+    skin = np.zeros((len(points), 4), np.int32)
+    skin[:, 0] = body
+    shares = np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1))
+    raised = np.tile(np.eye(3), (3, 1, 1))
+    raised[1] = Rotation.from_rotvec([0.0, -0.6, 0.0]).as_matrix()
+    poses = np.stack([np.tile(np.eye(3), (3, 1, 1)), raised])
+    return SubjectModel(
+        points,
+        np.concatenate([outward(p, *s) for p, s in zip(parts, sizes, strict=True)]),
+        np.zeros((0, 3), np.uint8),
+        skin,
+        shares,
+        np.array([[0.12, 0.0, 0.5], [0.0, 0.0, 0.6]]),
+        np.array([[0, 1], [0, 2]], np.int32),
+        np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
+        np.array([True, False]),
+        rotation_limits(poses[:, 1:]),
+        np.array(["shoulder", "neck"]),
+        np.array(["trunk", "arm", "head"]),
+        0,
+        np.array([0.0, 0.0, 0.3]),
+        np.ones((3, 3)),
+        poses,
+        float(np.linalg.norm(np.ptp(points, axis=0))),
+        SPACING,
+    )
+
+
+def take_of(model, frames=12):
+    """The subject elsewhere, turned by 100°, walking on while its arm rises and its head nods."""
+    time = np.linspace(0, 1, frames)
+    local = np.tile(np.eye(3), (frames, 3, 1, 1))
+    local[:, 0] = Rotation.from_rotvec(np.outer(1.75 + 0.3 * time, [0, 0, 1.0])).as_matrix()
+    local[:, 1] = Rotation.from_rotvec(np.outer(-0.3 - 0.7 * time, [0, 1.0, 0])).as_matrix()
+    local[:, 2] = Rotation.from_rotvec(np.outer(0.4 * np.sin(4 * time), [1.0, 0, 0])).as_matrix()
+    root = np.array([1.0, -2.0, 0.4]) + np.outer(time, [0.3, 0.1, 0.0])
+    bodies = body_motion(model.linkage, JointMotion(local, root))
+    return bodies, bodies.carry(model.points, model.skin_bodies, model.skin_shares)
+
+
+@pytest.fixture(scope="module")
+def tracked(model):
+    true, places = take_of(model)
+    rng = np.random.default_rng(0)
+    shaken = places + rng.normal(0, 0.002, places.shape)
+    found = track_take(model, lambda t: (shaken[t], None), len(places), SPACING, 2)
+    return true, places, found
+
+
+def test_another_take_is_followed_from_another_place_and_pose(model, tracked):
+    true, _, found = tracked
+    errors = np.rad2deg(turn_angles(np.swapaxes(found.bodies.rotations, -1, -2) @ true.rotations))
+    assert errors.mean() < 1.5 and errors.max() < 6.0
+    joints = model.linkage.joint_positions(found.bodies)
+    assert np.linalg.norm(joints - model.linkage.joint_positions(true), axis=2).max() < 0.015
+    assert found.distance.max() < 0.02 * model.extent
+
+
+def test_hinge_of_the_model_stays_a_hinge(model, tracked):
+    _, _, found = tracked
+    relative = np.swapaxes(found.bodies.rotations[:, 0], 1, 2) @ found.bodies.rotations[:, 1]
+    vectors = Rotation.from_matrix(relative).as_rotvec()
+    np.testing.assert_allclose(np.cross(vectors, model.joint_axes[0]), 0.0, atol=1e-9)
+
+
+def test_too_few_points_give_one_clear_line(model):
+    with pytest.raises(GeometryError, match="frame 0: 3 points"):
+        track_take(model, lambda t: (np.eye(3), None), 2, SPACING, 2)
+
+
+def test_tracked_points_are_hung_on_the_model(model):
+    true, places = take_of(model)
+    some = np.arange(0, len(model.points), 25)
+    seen = places[:, some].swapaxes(0, 1).copy()
+    seen[::2, :6] = np.nan
+    skin = attach_paths(model, true, MotionPaths(seen), 0.05)
+    np.testing.assert_allclose(skin.rest, model.points[some], atol=1e-9)
+
+
+def test_pose_prior_holds_what_nothing_is_seen_of(model):
+    true, places = take_of(model, 4)
+    linkage = model.linkage
+    motion = JointMotion(np.tile(np.eye(3), (4, 3, 1, 1)), np.tile(linkage.origin, (4, 1)))
+    trunk = np.flatnonzero(model.skin.body == 0)
+    seen = np.full((len(model.points), 4, 3), np.nan)
+    seen[trunk] = places[:, trunk].swapaxes(0, 1)
+    sightings = Observations.of_paths(seen, np.full(seen.shape[:2], 0.01))
+    prior = PosePrior(motion, 0.2, np.pi, 10.0)
+    found = adjust(linkage, motion, model.skin, sightings, pose_prior=prior, rounds=40, least_gain=1e-9)
+    np.testing.assert_allclose(found.bodies.rotations[:, 0], true.rotations[:, 0], atol=1e-3)
+    np.testing.assert_allclose(found.motion.local[:, 1:], motion.local[:, 1:], atol=1e-6)
+
+
+def test_matches_are_the_nearest_points_of_the_same_side(model):
+    scales = MatchingScales(0.02, 0.0, 0.1, SPACING, 0.05, 1.0)
+    surface = ModelSurface.of_model(model, 200, False)
+    still = BodyMotion(np.tile(np.eye(3), (1, 3, 1, 1)), np.zeros((1, 3, 3)))
+    shift = np.array([0.004, -0.003, 0.002])
+    frame = FrameSurface.of_points(model.points + shift, None, SPACING, scales, 150)
+    found = match_surfaces(surface, surface.posed(still), [frame], scales)
+    assert len(found.point) > 300
+    away = found.target - surface.skin.rest[found.point]
+    assert (np.abs(np.einsum("mi,mi->m", away, found.normal)) < 0.02).mean() > 0.95
+    assert (np.einsum("mi,mi->m", surface.normals[found.point], found.normal) > 0.2).all()
+
+
+def test_model_in_another_rest_pose_moves_alike(model):
+    true, places = take_of(model)
+    again = model.reposed(true, 5)
+    np.testing.assert_allclose(again.points, places[5], atol=1e-12)
+    carried = since(true, 5).carry(again.points, again.skin_bodies, again.skin_shares)
+    np.testing.assert_allclose(carried, places, atol=1e-9)
+    np.testing.assert_allclose(again.joints, posed(model.linkage, true, 5).joints)
+    pose = JointMotion(again.poses[1:], again.origin[None])
+    turned = body_motion(again.linkage, pose).rotations[0] @ true.rotations[5]
+    before = body_motion(model.linkage, JointMotion(model.poses[1:], model.origin[None])).rotations[0]
+    np.testing.assert_allclose(turned, before, atol=1e-12)
+
+
+def test_stage_follows_the_model_and_says_when_it_fits_poorly(model, tmp_path):
+    _, places = take_of(model, 3)
+    Run(tmp_path / "first").write_npz("model.npz", **model.arrays())
+    settings = Config(take=TakeSettings(rounds=1, steps=3, start_frames=1))
+    for name, scale in (("good", 1.0), ("large", 1.6)):
+        np.savez(tmp_path / f"{name}.npz", points=scale * places)
+        with threads(1) as executor:
+            scans = open_scans(tmp_path / f"{name}.npz", settings.scans)
+            job = Job(
+                Run(tmp_path / name), settings, executor, scans=scans, fps=25.0, model=tmp_path / "first/model.npz"
+            )
+            segment(job, "scans")
+    good, large = ((tmp_path / n / "diagnostics.json").read_text() for n in ("good", "large"))
+    assert "same scale" in large and "same scale" not in good
+    skeleton = Run(tmp_path / "good").read_npz("skeleton.npz")
+    assert skeleton["joint_names"].tolist() == ["shoulder", "neck"]
+    assert skeleton["body_rotations"].shape == (3, 3, 3, 3)
+    np.testing.assert_allclose(skeleton["body_rotations"][0], np.tile(np.eye(3), (3, 1, 1)), atol=1e-12)
+    assert (tmp_path / "good/bodies/000002.ply").is_file() and (tmp_path / "good/model.npz").is_file()
