@@ -11,7 +11,7 @@ from geomocap.segmentation.motion_paths import MotionPaths
 _VOTERS = 12
 _NEAREST = 3
 _PLANE = 8
-_THICKNESS = 0.35
+_THICKNESS = 0.7
 _CHUNK = 65536
 
 
@@ -88,5 +88,5 @@ def _label_some(
         offsets = back[:, None] - shapes[b].data[nearest]
         above = np.abs(np.einsum("mkc,mkc->mk", offsets, normals[b][nearest])).mean(axis=1)
         misfit = (distances.mean(axis=1) / (2.0 * spacing)) ** 2 + (above / (_THICKNESS * spacing)) ** 2
-        score[proposed, b] *= np.exp(-0.5 * misfit) + 1e-6
+        score[proposed, b] *= 1.0 / (1.0 + misfit)
     return score.argmax(axis=1).astype(np.int32)
