@@ -37,7 +37,7 @@ class TakeSettings(Settings):
     points: int = Field(default=1200, ge=100, description="points of the model, and of each frame, that are matched")
     start_frames: int = Field(default=2, ge=1, description="frames in which the model is looked for")
     steps: int = Field(default=8, ge=1, description="times that points are matched anew in each frame")
-    rounds: int = Field(default=3, ge=0, description="rounds in which all frames are fitted together")
+    rounds: int = Field(default=5, ge=0, description="rounds in which all frames are fitted together")
     normal: float = Field(default=0.03, ge=0, description="weight of normals in matching (extents)")
     color: float = Field(default=0.03, ge=0, description="weight of colours in matching (extents)")
     reach: float = Field(default=0.1, gt=0, description="points farther apart don't match (extents)")
