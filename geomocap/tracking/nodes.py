@@ -29,6 +29,8 @@ Points = Callable[[int], np.ndarray]
 
 FINE = ((1.0, 2.0), (0.8, 1.0), (0.6, 1.0), (0.6, 1.0))
 """Scales in node spacings and stiffness of the fine fit, step by step."""
+USUAL_NOISE = 0.035
+"""Median distance of a visual hull from the surface that fits it, node spacings."""
 END_SIZE = 0.12
 """How far an end of a limb stands out, share of the extent."""
 
@@ -65,9 +67,12 @@ class NodeTracks:
         return np.sqrt(np.trace(self.covariance, axis1=2, axis2=3) / 3)
 
     def motion_paths(self) -> MotionPaths:
-        """Return the nodes as motion paths, those that are never seen left out."""
+        """Return the nodes as motion paths, those that are never seen left out.
+
+        Without their rotations: how a node's neighbours turn about it is steadier than how it turns itself.
+        """
         seen = np.isfinite(self.positions[..., 0]).any(axis=1)
-        return MotionPaths(self.positions[seen], self.rotations[seen], self.sigma[seen], self.reference[seen])
+        return MotionPaths(self.positions[seen], sigma=self.sigma[seen], reference=self.reference[seen])
 
 
 class NodeModel:
@@ -116,7 +121,10 @@ class NodeModel:
             marks.add_to(found.A, found.b, g, x, R, s.anchor_weight, c)
             soft = 1 / (1 + (g.strain(x, R) / s.give) ** 2) ** 2
             share = len(g.samples) / len(g.nodes) / 4
-            x, R = step(g, self.pattern, x, R, stiffness * s.fine_stiffness * share * soft, found.A, found.b, 60)
+            # points that lie well on a surface are believed more, those of a rough hull less
+            rough = float(np.median(np.abs(found.across))) / (USUAL_NOISE * h)
+            firm = stiffness * s.fine_stiffness * min(max(rough, 0.25), 4.0)
+            x, R = step(g, self.pattern, x, R, firm * share * soft, found.A, found.b, 60)
         y, normals = g.deform(x, R)
         tree = cKDTree(target.coordinates(c))
         found = pull(target, tree, y, normals, g.features, c, s.point_weight, 0.0)

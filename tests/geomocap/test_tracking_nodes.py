@@ -278,7 +278,6 @@ def test_motion_paths_of_nodes(bending):
     _, tracks = bending
     paths = tracks.motion_paths()
     assert paths.count == 150
-    assert paths.rotations is not None
     np.testing.assert_array_equal(paths.reference, tracks.reference)
     assert np.isfinite(tracks.sigma).all()
 
