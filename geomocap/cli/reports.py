@@ -58,4 +58,6 @@ def tell_clouds(run: Run) -> None:
     for reason, number in sorted(record.reasons.items(), key=lambda r: -r[1]):
         console.print(f"  {number / record.frames:>9,.0f} {reason}")
     for warning, frames in record.warnings.items():
-        console.print(f"warning: {warning}" + (f" (in {frames} frames)" if record.frames > 1 else ""))
+        console.print(
+            f"warning: {warning}" + (f" (in {frames} of {record.frames} frames)" if record.frames > 1 else "")
+        )
