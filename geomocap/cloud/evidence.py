@@ -18,6 +18,8 @@ from geomocap.matching.lsm import match_multi
 from geomocap.matching.settings import KernelSettings
 from geomocap.matching.spline import ImageStack
 
+_LEAST = 30  # matches by which an image is judged
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -27,7 +29,7 @@ class Evidence:
     ----------
     residuals : (K,) float
         For each search image, the median distance from the epipolar lines of matches left free, pixels; infinite where
-        most are lost, NaN where there are none.
+        most are lost, NaN where there are too few to judge.
     growth : float
         Matched area over the area that the seeds stand for.
     removed : float
@@ -70,7 +72,8 @@ def evidence_of(
 ) -> Evidence:
     """Gather the evidence of one template's matches; `cell` is the distance of its seeds, pixels."""
     free = epipolar_residuals(images, surface, transfers, kernel, radius)
-    residuals = np.array([np.median(d[~np.isnan(d)]) if (~np.isnan(d)).any() else np.nan for d in free.T])
+    known = [d[~np.isnan(d)] for d in free.T]
+    residuals = np.array([np.median(d) if len(d) >= _LEAST else np.nan for d in known])
     matched, removed, seeds = int(surface.matched.sum()), int(surface.removed.sum()), len(surface.seeds)
     several = float((surface.seen.sum(axis=1) > 1).sum() / max(matched, 1)) if len(transfers) > 1 else np.nan
     growth = matched * surface.grid.step**2 / max(seeds * cell**2, 1.0)
@@ -83,7 +86,7 @@ def epipolar_residuals(
     transfers: np.ndarray,
     kernel: KernelSettings,
     radius: int,
-    sample: int = 300,
+    sample: int = 150,
 ) -> np.ndarray:
     """Distances from the epipolar lines of matches made anew without the geometric condition.
 
@@ -96,15 +99,17 @@ def epipolar_residuals(
     radius : int
         Of the patches, pixels.
     sample : int
-        Most matches that are made anew, evenly spread over the template.
+        Most matches in each search image that are made anew, evenly spread over the template.
 
     Returns
     -------
     (S, K) float, pixels; NaN where a search image did not see the point, infinite where the match was lost
     """
-    cells = np.flatnonzero(surface.matched)
-    if len(cells) > sample:
-        cells = cells[np.linspace(0, len(cells) - 1, sample).round().astype(int)]
+    chosen = [np.zeros(0, np.int64)]
+    for seen in surface.seen.T:
+        cells = np.flatnonzero(seen)
+        chosen.append(cells[np.unique(np.linspace(0, len(cells) - 1, min(sample, len(cells))).round().astype(int))])
+    cells = np.unique(np.concatenate(chosen))
     m = surface.matches
     start = np.concatenate([m.positions[cells], m.affine[cells].reshape(len(cells), len(transfers), 4)], axis=2)
     free = kernel.model_copy(update={"radius": radius, "sigma_condition": 0.0, "max_shift": 0.0})
