@@ -10,7 +10,21 @@ from geomocap.settings import Settings
 
 
 class TrackingSettings(Settings):
-    """How patches of the surface are placed and followed."""
+    """How patches of the surface are placed and followed.
+
+    Templates of a camera's first view slide least, but are lost sooner. A walking man, eight cameras 640×480: drift
+    median / 95 %, and length as a share of the frames in which two cameras see the point:
+
+        ========  =====================  ======  =====================  ======
+        template  20 frames: drift (mm)  length  60 frames: drift (mm)  length
+        ========  =====================  ======  =====================  ======
+        first     0.65 / 4.4             0.82    0.70 / 5.0             0.72
+        updated   0.72 / 5.0             0.86    0.92 / 6.2             0.77
+        previous  0.79 / 5.0             0.90
+        ========  =====================  ======  =====================  ======
+
+    Bodies come out better from the longer tracks of "updated".
+    """
 
     n_patches: int = Field(2000, ge=10, le=100_000, description="Patches placed on a frame's whole surface")
     radius_px: int = Field(5, ge=2, le=20, description="Half the width of a patch (pixels)")
@@ -19,7 +33,8 @@ class TrackingSettings(Settings):
     )
     blurs_px: tuple[float, float] = Field((2.5, 0.8), description="Blur of the coarse and the fine level (pixels)")
     templates: Literal["first", "updated", "previous"] = Field(
-        "first", description="Template: the first view of a camera, a new one where it fits badly, or the last frame's"
+        "updated",
+        description="Template: the first view of a camera, a new one where it fits badly, or the last frame's",
     )
     seed_every: int = Field(10, ge=1, description="Frames between two looks for surface without patches")
     seed_correlation: float = Field(0.85, gt=0, lt=1, description="Least correlation between cameras for a new patch")
