@@ -121,9 +121,9 @@ class NodeModel:
             marks.add_to(found.A, found.b, g, x, R, s.anchor_weight, c)
             soft = 1 / (1 + (g.strain(x, R) / s.give) ** 2) ** 2
             share = len(g.samples) / len(g.nodes) / 4
-            # points that lie well on a surface are believed more, those of a rough hull less
+            # points that lie well on a surface are believed more than those of a rough hull
             rough = float(np.median(np.abs(found.across))) / (USUAL_NOISE * h)
-            firm = stiffness * s.fine_stiffness * min(max(rough, 0.25), 4.0)
+            firm = stiffness * s.fine_stiffness * min(max(rough, 0.25), 1.0)
             x, R = step(g, self.pattern, x, R, firm * share * soft, found.A, found.b, 60)
         y, normals = g.deform(x, R)
         tree = cKDTree(target.coordinates(c))
