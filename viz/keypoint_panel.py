@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from geomocap.pipeline.keypoints import SMOOTHING
 from geomocap.tracking.keypoints import REACH, KeyPointPaths
 from geomocap.tracking.smoothing import smooth_motion
 from viz.keypoint_marks import Marks
@@ -195,7 +194,7 @@ class Panel:
         elif t == point.frame:
             words += f"Here it has {paths.n_tracks[t, k]} trajectories {'around' if paths.bridged[t, k] else 'inside'}."
         else:
-            motion = smooth_motion(paths.positions[None, :, k], self._subject.fps, settings=SMOOTHING)
+            motion = smooth_motion(paths.positions[None, :, k], self._subject.fps)
             speed = float(np.linalg.norm(motion.velocities[0, t]))
             how = "bridged by" if paths.bridged[t, k] else "moved by"
             words += f"Here {how} {paths.n_tracks[t, k]} trajectories, ± {1000 * paths.std[t, k]:.1f} mm"

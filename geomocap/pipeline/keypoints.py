@@ -19,11 +19,8 @@ from geomocap.export.trc import write_trc
 from geomocap.run import Run
 from geomocap.tracking.keypoint_file import KeyPointFile, follow_regions
 from geomocap.tracking.keypoints import REACH, KeyPointPaths, Measured
-from geomocap.tracking.smoothing import SmoothingSettings, smooth_motion
+from geomocap.tracking.smoothing import smooth_motion
 from geomocap.tracking.trajectories import LAST_FRAME, Trajectories
-
-# A key-point is a mean of trajectories and hardly noisy: a cubic keeps quick motion where a parabola flattens it.
-SMOOTHING = SmoothingSettings(half_width=3, degree=3)
 
 
 @dataclass(frozen=True)
@@ -71,7 +68,7 @@ def write_results(run: Run, file: KeyPointFile, paths: KeyPointPaths) -> Followe
         If the frame rate isn't known, or a file can't be written.
     """
     fps = run_fps(run)
-    motion = smooth_motion(paths.positions.transpose(1, 0, 2), fps, settings=SMOOTHING)
+    motion = smooth_motion(paths.positions.transpose(1, 0, 2), fps)
     names = file.names
     arrays = {
         "names": np.array(names),

@@ -4,7 +4,9 @@ At each frame t a polynomial of degree `degree` in time is fitted by weighted le
 `half_width` frames (Savitzky, Golay 1964, with gaps, unequal weights and the ends of a trajectory handled alike): its
 derivatives at t are velocity and acceleration. A fit is linear in the positions, v = Σ c_i x_i, so that its noise
 gain √(Σ c_i²) and its standard deviation √(Σ c_i² σ_i²) are known exactly. Raw differences at 30 fps have a gain of
-30/√2 = 21 a second for velocity and 2205 a second² for acceleration; five frames on each side lower that to 2.9 and 61.
+30/√2 = 21 a second for velocity and 2205 a second² for acceleration; a cubic over three frames on each side has 15
+and 196, a parabola 5.7 and 196, but the parabola flattens quick motion: on patches of a walking man, noisy by tenths of
+a millimetre, its velocities were wrong by 0.045 m/s RMS, the cubic's by 0.026 (a kicking horse: 0.32 and 0.13).
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ class SmoothingSettings(Settings):
     """How velocities and accelerations are estimated."""
 
     half_width: int = Field(3, ge=1, description="Frames on each side that a velocity is estimated from")
-    degree: int = Field(2, ge=1, le=4, description="Degree of the polynomial in time")
+    degree: int = Field(3, ge=1, le=4, description="Degree of the polynomial in time")
 
 
 @dataclass(frozen=True)

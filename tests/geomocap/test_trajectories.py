@@ -72,7 +72,7 @@ def test_noise_is_found_from_the_residuals_if_it_is_not_given():
 def test_noise_gain_is_savitzky_golay():
     # seven points: velocity weights i / 28, acceleration weights (i² − 4) / 42 · 2 … of a quadratic
     steps = np.arange(-3, 4)
-    velocity, acceleration = noise_gain(SmoothingSettings(half_width=3), FPS)
+    velocity, acceleration = noise_gain(SmoothingSettings(half_width=3, degree=2), FPS)
     assert_allclose(velocity, FPS * np.sqrt((steps**2).sum()) / 28, rtol=1e-6)
     assert_allclose(acceleration, FPS**2 * np.sqrt(((steps**2 - 4.0) ** 2).sum()) / 42, rtol=1e-6)
 
