@@ -77,7 +77,8 @@ def track_surface(
             several, one = _taken(state)
             patches = seed_patches(view, several, spacing, settings, rng)
             if state is None:
-                by_one = len(patches) < settings.one_camera_below * settings.n_patches
+                few = view.count <= settings.one_camera_up_to
+                by_one = few and len(patches) < settings.one_camera_below * settings.n_patches
                 if len(patches) > settings.n_patches:
                     spacing *= float(np.sqrt(len(patches) / settings.n_patches))
                     patches = patches.select(np.sort(rng.choice(len(patches), settings.n_patches, replace=False)))

@@ -46,6 +46,9 @@ class TrackingSettings(Settings):
     one_camera_below: float = Field(
         0.5, ge=0, le=1, description="Share of the surface on which two cameras agree, below which one alone may do"
     )
+    one_camera_up_to: int = Field(
+        5, ge=0, description="Most cameras of such captures: many cameras that disagree look at what isn't there"
+    )
     sigma_px: float = Field(0.2, gt=0, description="Largest standard deviation of a position (pixels on the patch)")
     slack_px: float = Field(8.0, gt=0, description="Depth, beyond two voxels, of what hides a patch (pixels on it)")
     neighbour_px: float = Field(3.0, gt=0, description="Largest distance from where neighbours' motion puts it (px)")
