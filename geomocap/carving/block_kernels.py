@@ -88,9 +88,26 @@ def classify(P, size, subject, seen, unseen, c, x, y, z, dx, dy, dz):
     return BACKGROUND if inside and visible == area else MIXED
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def carve(P, size, masks, valid, subject, seen, unseen, tolerance, min_views, origin, edge, Z, bits):
-    """Carve all blocks, one a task, each depth first.
+@njit(cache=True, nogil=True)
+def _carve_block(
+    corner_i,
+    corner_j,
+    corner_k,
+    P,
+    size,
+    masks,
+    valid,
+    subject,
+    seen,
+    unseen,
+    tolerance,
+    min_views,
+    origin,
+    edge,
+    Z,
+    bits,
+):
+    """Carve the block with this corner, depth first; further parameters as of `carve`.
 
     A node of the stack is (x, y, z index of its corner, level, cameras undecided about its parent, subject votes,
     background votes); `cameras[level]` lists the undecided ones for all children of one parent, which follow each
@@ -98,96 +115,104 @@ def carve(P, size, masks, valid, subject, seen, unseen, tolerance, min_views, or
     """
     C = P.shape[0]
     H, W = masks.shape[1], masks.shape[2]
+    X, Y = bits.shape[:2]
+    cameras = np.empty((LEVELS + 1, C), np.int64)
+    stack = np.empty((7 * LEVELS + 1, 7), np.int64)
+    for c in range(C):
+        cameras[0, c] = c
+    stack[0, 0] = corner_i
+    stack[0, 1] = corner_j
+    stack[0, 2] = corner_k
+    stack[0, 3] = 0
+    stack[0, 4] = C
+    stack[0, 5] = 0
+    stack[0, 6] = 0
+    top = 1
+    while top > 0:
+        top -= 1
+        i0, j0, k0, level = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
+        n, n_subject, n_background = stack[top, 4], stack[top, 5], stack[top, 6]
+        step = BLOCK >> level
+        i1, j1, k1 = min(i0 + step, X), min(j0 + step, Y), min(k0 + step, Z)
+        # what do the undecided cameras say of the whole block?
+        x = origin[0] + (i0 + i1) * 0.5 * edge
+        y = origin[1] + (j0 + j1) * 0.5 * edge
+        z = origin[2] + (k0 + k1) * 0.5 * edge
+        dx, dy, dz = (i1 - i0 - 1) * 0.5 * edge, (j1 - j0 - 1) * 0.5 * edge, (k1 - k0 - 1) * 0.5 * edge
+        mixed = 0
+        for q in range(n):
+            c = cameras[level, q]
+            answer = classify(P, size, subject, seen, unseen, c, x, y, z, dx, dy, dz)
+            if answer == MIXED:
+                cameras[level + 1, mixed] = c
+                mixed += 1
+            elif answer == SUBJECT:
+                n_subject += 1
+            elif answer == BACKGROUND:
+                n_background += 1
+                if n_background > tolerance:
+                    break
+        views = n_subject + n_background
+        if n_background > tolerance or (unseen and views + mixed < min_views):
+            continue
+        if n_background + mixed <= tolerance and (not unseen or views >= min_views):
+            word = np.uint32(((1 << (k1 - k0)) - 1) << (k0 & 31))
+            for i in range(i0, i1):
+                for j in range(j0, j1):
+                    bits[i, j, k0 >> 5] |= word
+            continue
+        if step > 2:
+            step //= 2
+            for part in range(8):
+                i, j, k = i0 + step * (part & 1), j0 + step * ((part >> 1) & 1), k0 + step * (part >> 2)
+                if i < i1 and j < j1 and k < k1:
+                    stack[top, 0] = i
+                    stack[top, 1] = j
+                    stack[top, 2] = k
+                    stack[top, 3] = level + 1
+                    stack[top, 4] = mixed
+                    stack[top, 5] = n_subject
+                    stack[top, 6] = n_background
+                    top += 1
+            continue
+        # too small to divide: every voxel by itself, in the cameras that are undecided
+        for i in range(i0, i1):
+            x = origin[0] + (i + 0.5) * edge
+            for j in range(j0, j1):
+                y = origin[1] + (j + 0.5) * edge
+                for k in range(k0, k1):
+                    z = origin[2] + (k + 0.5) * edge
+                    against, views = n_background, n_subject + n_background
+                    for q in range(mixed):
+                        c = cameras[level + 1, q]
+                        w = P[c, 2, 0] * x + P[c, 2, 1] * y + P[c, 2, 2] * z + P[c, 2, 3]
+                        u = v = -1.0
+                        if w > 0.0:
+                            u = (P[c, 0, 0] * x + P[c, 0, 1] * y + P[c, 0, 2] * z + P[c, 0, 3]) / w
+                            v = (P[c, 1, 0] * x + P[c, 1, 1] * y + P[c, 1, 2] * z + P[c, 1, 3]) / w
+                        if not (u >= 0.0 and v >= 0.0 and u < W and v < H):
+                            against += not unseen
+                        elif masks[c, int(v), int(u)]:
+                            views += 1
+                        elif not unseen:
+                            against += 1
+                        elif valid[c, int(v), int(u)]:
+                            against += 1
+                            views += 1
+                        if against > tolerance:
+                            break
+                    if against <= tolerance and (not unseen or views >= min_views):
+                        bits[i, j, k >> 5] |= np.uint32(1 << (k & 31))
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def carve(P, size, masks, valid, subject, seen, unseen, tolerance, min_views, origin, edge, Z, bits):
+    """Carve all blocks, one a task."""
     X, Y, nz = bits.shape
     nx, ny = (X + BLOCK - 1) // BLOCK, (Y + BLOCK - 1) // BLOCK
     for b in prange(nx * ny * nz):
-        cameras = np.empty((LEVELS + 1, C), np.int64)
-        stack = np.empty((7 * LEVELS + 1, 7), np.int64)
-        for c in range(C):
-            cameras[0, c] = c
-        stack[0, 0] = b // (ny * nz) * BLOCK
-        stack[0, 1] = b // nz % ny * BLOCK
-        stack[0, 2] = b % nz * BLOCK
-        stack[0, 3] = 0
-        stack[0, 4] = C
-        stack[0, 5] = 0
-        stack[0, 6] = 0
-        top = 1
-        while top > 0:
-            top -= 1
-            i0, j0, k0, level = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
-            n, n_subject, n_background = stack[top, 4], stack[top, 5], stack[top, 6]
-            step = BLOCK >> level
-            i1, j1, k1 = min(i0 + step, X), min(j0 + step, Y), min(k0 + step, Z)
-            # what do the undecided cameras say of the whole block?
-            x = origin[0] + (i0 + i1) * 0.5 * edge
-            y = origin[1] + (j0 + j1) * 0.5 * edge
-            z = origin[2] + (k0 + k1) * 0.5 * edge
-            dx, dy, dz = (i1 - i0 - 1) * 0.5 * edge, (j1 - j0 - 1) * 0.5 * edge, (k1 - k0 - 1) * 0.5 * edge
-            mixed = 0
-            for q in range(n):
-                c = cameras[level, q]
-                answer = classify(P, size, subject, seen, unseen, c, x, y, z, dx, dy, dz)
-                if answer == MIXED:
-                    cameras[level + 1, mixed] = c
-                    mixed += 1
-                elif answer == SUBJECT:
-                    n_subject += 1
-                elif answer == BACKGROUND:
-                    n_background += 1
-                    if n_background > tolerance:
-                        break
-            views = n_subject + n_background
-            if n_background > tolerance or (unseen and views + mixed < min_views):
-                continue
-            if n_background + mixed <= tolerance and (not unseen or views >= min_views):
-                word = np.uint32(((1 << (k1 - k0)) - 1) << (k0 & 31))
-                for i in range(i0, i1):
-                    for j in range(j0, j1):
-                        bits[i, j, k0 >> 5] |= word
-                continue
-            if step > 2:
-                step //= 2
-                for part in range(8):
-                    i, j, k = i0 + step * (part & 1), j0 + step * ((part >> 1) & 1), k0 + step * (part >> 2)
-                    if i < i1 and j < j1 and k < k1:
-                        stack[top, 0] = i
-                        stack[top, 1] = j
-                        stack[top, 2] = k
-                        stack[top, 3] = level + 1
-                        stack[top, 4] = mixed
-                        stack[top, 5] = n_subject
-                        stack[top, 6] = n_background
-                        top += 1
-                continue
-            # too small to divide: every voxel by itself, in the cameras that are undecided
-            for i in range(i0, i1):
-                x = origin[0] + (i + 0.5) * edge
-                for j in range(j0, j1):
-                    y = origin[1] + (j + 0.5) * edge
-                    for k in range(k0, k1):
-                        z = origin[2] + (k + 0.5) * edge
-                        against, views = n_background, n_subject + n_background
-                        for q in range(mixed):
-                            c = cameras[level + 1, q]
-                            w = P[c, 2, 0] * x + P[c, 2, 1] * y + P[c, 2, 2] * z + P[c, 2, 3]
-                            u = v = -1.0
-                            if w > 0.0:
-                                u = (P[c, 0, 0] * x + P[c, 0, 1] * y + P[c, 0, 2] * z + P[c, 0, 3]) / w
-                                v = (P[c, 1, 0] * x + P[c, 1, 1] * y + P[c, 1, 2] * z + P[c, 1, 3]) / w
-                            if not (u >= 0.0 and v >= 0.0 and u < W and v < H):
-                                against += not unseen
-                            elif masks[c, int(v), int(u)]:
-                                views += 1
-                            elif not unseen:
-                                against += 1
-                            elif valid[c, int(v), int(u)]:
-                                against += 1
-                                views += 1
-                            if against > tolerance:
-                                break
-                        if against <= tolerance and (not unseen or views >= min_views):
-                            bits[i, j, k >> 5] |= np.uint32(1 << (k & 31))
+        i, j, k = b // (ny * nz) * BLOCK, b // nz % ny * BLOCK, b % nz * BLOCK
+        _carve_block(i, j, k, P, size, masks, valid, subject, seen, unseen, tolerance, min_views, origin, edge, Z, bits)
 
 
 @njit(cache=True, nogil=True)

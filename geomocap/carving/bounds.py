@@ -7,6 +7,7 @@ kept are halved until the subject is resolved.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -60,7 +61,7 @@ def subject_cells(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarr
         cells, level = np.zeros((1, 3), np.int64), 0
         while level < MAX_LEVEL and 0 < len(cells) < MAX_CELLS:
             cells, level = halve(views, settings, tables, cells, origin, 2 * reach / 2**level), level + 1
-            if len(cells) >= CELLS:
+            if len(cells) >= CELLS and np.ptp(cells, axis=0).max() + 1 >= CELLS:
                 label = _connected(cells)
                 sizes = np.bincount(label)
                 if np.ptp(cells[label == sizes.argmax()], axis=0).max() + 1 >= CELLS:
@@ -138,11 +139,12 @@ def focus(views: PinholeViews) -> tuple[np.ndarray, float]:
     """
     centers, rays = [], []
     for P, mask in zip(views.projections, views.masks, strict=True):
-        v, u = np.nonzero(mask)
-        if u.size == 0:
-            v, u = (np.array([n / 2]) for n in mask.shape)
+        # how much of the silhouette each column and each row has
+        columns, rows = (cv2.reduce(mask, k, cv2.REDUCE_SUM, dtype=cv2.CV_32S).ravel() for k in (0, 1))
+        area = columns.sum()
+        u, v = (n @ np.arange(len(n)) / area if area else len(n) / 2 for n in (columns, rows))
         inverse = np.linalg.inv(P[:, :3])
-        ray = inverse @ [u.mean() + 0.5, v.mean() + 0.5, 1.0]
+        ray = inverse @ [u + 0.5, v + 0.5, 1.0]
         centers.append(-inverse @ P[:, 3])
         rays.append(ray / np.linalg.norm(ray))
     C, D = np.array(centers), np.array(rays)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from scipy.spatial import cKDTree
 
 from geomocap.carving.grid import Grid
@@ -36,10 +36,10 @@ def voxel_colors(views: PinholeViews, images: np.ndarray, grid: Grid, occupancy:
     return colors
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _blend(seen, samples, positions, normal, centers, colors, has_color):
     N, C = seen.shape
-    for n in prange(N):
+    for n in range(N):
         weights = np.empty(C, np.float64)
         values = np.empty(C, np.float64)
         order = np.empty(C, np.int64)

@@ -7,7 +7,7 @@ cameras that look at different places of the true surface behind it.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from geomocap.carving.grid import Grid
 from geomocap.carving.occupancy import Occupancy
@@ -43,9 +43,10 @@ def carve_inconsistent(
     judged, bad = np.zeros_like(bits), np.zeros_like(bits)
     changed = np.ones_like(bits, dtype=np.bool_)
     gains = np.ones((len(views), 3), np.float32)
+    depth = None
     for step in range(settings.max_passes):
         surface = SurfaceVoxels.of(Occupancy(bits, occupancy.shape))
-        depth = depth_buffers(views, grid, surface)
+        depth = depth_buffers(views, grid, surface, depth)
         voxels = surface if step == 0 else surface.select(_near(changed, surface.indices))
         seen = sightings(views, images, grid, voxels, depth, settings.window)
         if step == 0 and settings.gain:
@@ -90,10 +91,10 @@ def color_deviation(seen: Sightings, gains: np.ndarray, min_cameras: int) -> np.
     return out
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _deviate(seen, colors, low, high, gains, min_cameras, out):
     N, C = seen.shape
-    for n in prange(N):
+    for n in range(N):
         values = np.empty(C, np.float32)
         count = 0
         total = np.float32(0)

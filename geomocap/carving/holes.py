@@ -78,6 +78,9 @@ def enclosed_holes(mask: np.ndarray, least: int = 6) -> list[tuple[np.ndarray, n
     list of pairs (N, 2) int, (M, 2) int
         Pixels (x, y) of each hole, and of the subject along its rim; largest hole first.
     """
+    left, top, width, height = cv2.boundingRect(mask)
+    left, top = max(left - 1, 0), max(top - 1, 0)
+    mask = mask[top : top + height + 2, left : left + width + 2]  # what reaches its border is open, too
     h, w = mask.shape
     count, labels, stats, _ = cv2.connectedComponentsWithStats((mask == 0).view(np.uint8), connectivity=4)
     holes: list[tuple[np.ndarray, np.ndarray]] = []
@@ -94,6 +97,7 @@ def enclosed_holes(mask: np.ndarray, least: int = 6) -> list[tuple[np.ndarray, n
         v, u = np.nonzero(inside)
         rv, ru = np.nonzero(rim)
         if len(ru):
+            x0, y0 = x0 + left, y0 + top
             holes.append((np.column_stack([u + x0, v + y0]), np.column_stack([ru + x0, rv + y0])))
     return holes
 

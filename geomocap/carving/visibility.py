@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from geomocap.carving.grid import Grid
 from geomocap.carving.occupancy import Occupancy
@@ -63,9 +63,19 @@ class SurfaceVoxels:
         return SurfaceVoxels(self.indices[which], self.faces[which])
 
 
-def depth_buffers(views: PinholeViews, grid: Grid, surface: SurfaceVoxels) -> np.ndarray:
-    """Draw surface voxels as cubes: depth of the nearest, (C, H, W) float32, metres; inf where none is."""
-    depth = np.full(views.masks.shape, np.inf, np.float32)
+def depth_buffers(views: PinholeViews, grid: Grid, surface: SurfaceVoxels, out: np.ndarray | None = None) -> np.ndarray:
+    """Draw surface voxels as cubes: depth of the nearest, (C, H, W) float32, metres; inf where none is.
+
+    Parameters
+    ----------
+    views : PinholeViews
+    grid : Grid
+    surface : SurfaceVoxels
+    out : (C, H, W) float32, optional
+        Array to fill and return, to be used again.
+    """
+    depth = np.empty(views.masks.shape, np.float32) if out is None else out
+    depth.fill(np.inf)
     P = views.projections
     _draw(P, _centers(P), surface.indices, surface.faces, grid.origin, grid.voxel_size, depth)
     return depth
@@ -147,11 +157,11 @@ def _faces_camera(faces, dx, dy, dz, half):
     return (turned & faces) != 0
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _draw(P, centers, surface, faces, origin, edge, depth):
     C, H, W = depth.shape
     half = 0.5 * edge
-    for c in prange(C):
+    for c in range(C):
         for n in range(len(surface)):
             x = origin[0] + (surface[n, 0] + 0.5) * edge
             y = origin[1] + (surface[n, 1] + 0.5) * edge
@@ -181,13 +191,13 @@ def _draw(P, centers, surface, faces, origin, edge, depth):
                         depth[c, row, column] = d
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _look(
     P, centers, masks, valid, images, depth, surface, faces, origin, edge, slack, window, seen, colors, low, high
 ):
     C, H, W = masks.shape
     half = 0.5 * edge
-    for n in prange(len(surface)):
+    for n in range(len(surface)):
         x = origin[0] + (surface[n, 0] + 0.5) * edge
         y = origin[1] + (surface[n, 1] + 0.5) * edge
         z = origin[2] + (surface[n, 2] + 0.5) * edge
@@ -236,7 +246,7 @@ def _look(
             high[n, c, 0], high[n, c, 1], high[n, c, 2] = r1, g1, b1
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _away(bits, surface):
     X, Y, K = bits.shape
     # of five bits along z: how many are set, and the sum of their offsets −2 … 2
@@ -247,7 +257,7 @@ def _away(bits, surface):
                 counts[pattern] += 1
                 moments[pattern] += b - 2
     out = np.zeros((len(surface), 3), np.float32)
-    for n in prange(len(surface)):
+    for n in range(len(surface)):
         i, j, k = surface[n, 0], surface[n, 1], surface[n, 2]
         word, shift = k >> 5, k & 31
         x = y = z = 0

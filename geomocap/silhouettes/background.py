@@ -206,11 +206,9 @@ def _noise(
     g = gradient[part][use]
     if g.size < 50:
         return np.full(gradient.shape, 2.0, np.float32)
+    mean = model.mean[part][use]
     residuals = np.array(
-        [
-            (f[part][use] - (gain * model.mean[part][use] + offset))
-            for f, (gain, offset) in zip(frames, lights, strict=True)
-        ]
+        [f[part][use] - (gain * mean + offset) for f, (gain, offset) in zip(frames, lights, strict=True)]
     )
     edges = np.quantile(g, np.linspace(0, 1, GRADIENT_BINS + 1))
     which = np.clip(np.searchsorted(edges, g, side="right") - 1, 0, GRADIENT_BINS - 1)
@@ -242,11 +240,34 @@ def _agreeing_mean(
     """Mean of the plate and the frames that agree with it within 3 sigma in all channels."""
     total, count = plate.copy(), np.ones(sigma.shape, np.float32)
     for image, (gain, offset) in zip(frames, lights, strict=True):
-        corrected = ((image - offset) / gain).astype(np.float32)
-        agrees = (np.abs(corrected - plate).max(axis=-1) < 3.0 * sigma).astype(np.float32)
-        total += corrected * agrees[..., None]
-        count += agrees
+        relit = ((np.arange(256)[:, None] - offset) / gain).astype(np.float32)
+        add_agreeing(np.ascontiguousarray(image), relit, plate, sigma, total, count)
     return total / count[..., None]
+
+
+@njit(cache=True, nogil=True)
+def add_agreeing(image, relit, plate, sigma, total, count):
+    """Add a frame to the sum and the count of frames, where it agrees with the plate within 3 sigma in all channels.
+
+    Parameters
+    ----------
+    image : (H, W, 3) uint8
+    relit : (256, 3) float32
+        What each grey level of a channel would be in the plate's light.
+    plate : (H, W, 3) float32
+    sigma : (H, W) float32
+    total, count : (H, W, 3), (H, W) float32
+        Changed in place.
+    """
+    for y in range(image.shape[0]):
+        for x in range(image.shape[1]):
+            a, b, c = relit[image[y, x, 0], 0], relit[image[y, x, 1], 1], relit[image[y, x, 2], 2]
+            reach = np.float32(3.0) * sigma[y, x]
+            if abs(a - plate[y, x, 0]) < reach and abs(b - plate[y, x, 1]) < reach and abs(c - plate[y, x, 2]) < reach:
+                total[y, x, 0] += a
+                total[y, x, 1] += b
+                total[y, x, 2] += c
+                count[y, x] += np.float32(1.0)
 
 
 @njit(cache=True, nogil=True, parallel=True)

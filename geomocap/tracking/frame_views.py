@@ -133,20 +133,23 @@ class FrameViews:
         depth = np.einsum("cj,nj->nc", self.projections[:, 2, :3], points) + self.projections[:, 2, 3]
         return np.maximum(depth, 0.0) / focal
 
-    def surface_depth(self, points: np.ndarray) -> np.ndarray:
-        """Return the surface's depth at the pixels that show world points (N, 3): (N, C), NaN where none is seen."""
-        inside, row, column = self._pixels(points)
+    def depths(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the depths of world points (N, 3), and of the surface at the pixels that show them.
+
+        Both are (N, C) float, metres; that of the surface is NaN where none is seen.
+        """
+        pixel, depth = self.project(points)
+        inside, row, column = self._array_indices(pixel)
         found = self.depth[np.arange(self.count), row, column].astype(np.float64)
-        return np.where(inside & np.isfinite(found), found, np.nan)
+        return depth, np.where(inside & np.isfinite(found), found, np.nan)
 
     def may_be_subject(self, points: np.ndarray) -> np.ndarray:
         """Whether world points (N, 3) lie in the silhouettes of all cameras that see them, or close by: (N,) bool."""
-        inside, row, column = self._pixels(points)
+        inside, row, column = self._array_indices(self.project(points)[0])
         return ((self.allowed[np.arange(self.count), row, column] != 0) | ~inside).all(axis=1)
 
-    def _pixels(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Whether world points (N, 3) are in the images, and the rows and columns that show them, all (N, C)."""
-        pixel, _ = self.project(points)
+    def _array_indices(self, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Whether pixels (N, C, 2) are in the images, and their rows and columns, all (N, C)."""
         _, H, W = self.masks.shape
         inside = np.isfinite(pixel).all(axis=2)
         column = np.rint(np.where(inside, pixel[:, :, 0], -1)).clip(-1, W).astype(np.int64)

@@ -65,8 +65,8 @@ def image_precision(patches: Patches, which: np.ndarray, camera: np.ndarray, cor
     which, camera : (A,) int
     correlation : (A,) float
     """
-    template = patches.templates[which, camera, -1].astype(np.float64)
-    usable = patches.usable[which, camera][:, :, None] != 0
+    template = patches.templates[patches.rows[which], camera, -1].astype(np.float64)
+    usable = patches.usable[patches.rows[which], camera][:, :, None] != 0
     count = np.maximum(usable.sum(axis=1), 1)
     free = np.where(usable, template - (template * usable).sum(axis=1, keepdims=True) / count[:, None], 0.0)
     slopes = free[:, :, 1:]
@@ -83,8 +83,8 @@ def _on_surface(
     """Places of patches `which` moved along the line of sight to their old depth under the surface."""
     X, c = positions[which], camera[which]
     rows = np.arange(len(which))
-    depth = view.project(X)[1][rows, c]
-    away = view.surface_depth(X)[rows, c] + patches.hidden[which, c] - depth
+    depth, surface = (d[rows, c] for d in view.depths(X))
+    away = surface + patches.hidden[which, c] - depth
     known = np.flatnonzero(np.isfinite(away) & (np.abs(away) < _REACH_VOXELS * view.voxel_size) & (depth > 0))
     if len(known) < _NEIGHBOURS:
         return X

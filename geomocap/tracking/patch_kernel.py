@@ -30,6 +30,7 @@ from geomocap.tracking.patch_templates import (
     LEAST_VARIANCE,
     bilinear,
     local_camera,
+    set_place,
     solve_normal,
     turn_by,
 )
@@ -138,6 +139,166 @@ def _compare(A, shape, image, samples, count, with_slopes, J, T, b):
     return product / count, square / count - (total / count) ** 2
 
 
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _align_one(
+    n,
+    X,
+    Q,
+    shape,
+    size,
+    rows,
+    templates,
+    usable,
+    use,
+    images,
+    level,
+    stride,
+    masks,
+    use_mask,
+    P,
+    centers,
+    prior_X,
+    prior_Q,
+    prior_shift,
+    prior_turn,
+    iterations,
+    least_correlation,
+    correlation,
+    covariance,
+):
+    """Align patch `n`; parameters as of `align_patches`."""
+    M = shape.shape[1]
+    C = use.shape[1]
+    A = np.empty((C, 3, 4))
+    J = np.zeros((C, M, 6), np.float32)
+    T = np.empty((C, M), np.float32)
+    samples = np.empty((C, M), np.int64)
+    counts = np.zeros(C, np.int64)
+    variance_t = np.zeros(C)
+    H = np.zeros((C, 6, 6))
+    b = np.zeros((C, 6))
+    moments = np.zeros(1)
+    weights = np.zeros(C)
+    gains = np.zeros(C)
+    N6, L6 = np.zeros((6, 6)), np.zeros((6, 6))
+    r6, x6, local = np.zeros(6), np.zeros(6), np.zeros(3)
+    x_n, q_n, q_new = X[n].copy(), Q[n].copy(), np.zeros((3, 3))
+    best_x, best_q, best = x_n.copy(), q_n.copy(), -2.0
+    seen, last = 0, False
+    for c in range(C):
+        correlation[n, c] = -1.0
+        if not use[n, c]:
+            continue
+        local_camera(P[c], x_n, q_n, A[c])
+        for r in range(3):
+            local[r] = 0.0
+            for k in range(3):
+                local[r] += q_n[k, r] * (centers[c, k] - x_n[k])
+        counts[c] = _prepare(
+            A[c],
+            local,
+            shape[n],
+            templates[rows[n], c, level],
+            usable[rows[n], c],
+            masks[c],
+            use_mask,
+            iterations > 0,
+            stride,
+            samples[c],
+            J[c],
+            T[c],
+            moments,
+        )
+        if counts[c] == 0:
+            continue
+        seen += 1
+        variance_t[c] = moments[0]
+        if iterations > 0:
+            for i in range(counts[c]):
+                for r in range(6):
+                    for k in range(r + 1):
+                        H[c, r, k] += J[c, i, r] * J[c, i, k]
+    for r in range(6):
+        covariance[n, r] = np.nan
+    if seen == 0:
+        return
+    now = np.full(C, -1.0)
+    for step in range(iterations + 1):
+        top, score, share = -1.0, 0.0, 0.0
+        for c in range(C):
+            if counts[c] == 0:
+                continue
+            if step > 0:
+                local_camera(P[c], x_n, q_n, A[c])
+            product, variance = _compare(
+                A[c], shape[n], images[c], samples[c], counts[c], iterations > 0, J[c], T[c], b[c]
+            )
+            now[c] = product / math.sqrt(max(variance, 1e-3) * variance_t[c])
+            gains[c] = min(max(product / max(variance, 1e-3), 1 / _GAIN), _GAIN)
+            residual = max(variance_t[c] * (1 - now[c] * abs(now[c])), 0.0)
+            weights[c] = 1 / (residual * counts[c] / max(counts[c] - 8, 1) + _FLOOR**2)
+            top = max(top, now[c])
+        for c in range(C):
+            if counts[c] == 0:
+                continue
+            if now[c] < least_correlation and now[c] < top - 0.05:
+                weights[c] = 0.0
+            score += counts[c] * now[c]
+            share += counts[c]
+        score /= share
+        if score > best:
+            best = score
+            set_place(best_x, best_q, x_n, q_n)
+            for c in range(C):
+                correlation[n, c] = now[c]
+        elif step > 2 and score < best - 0.1:
+            break
+        if iterations == 0:
+            break
+        # shared normal equations of all cameras, with the expected place as an observation
+        for r in range(6):
+            sd = prior_shift[n] if r < 3 else prior_turn[n]
+            r6[r] = 0.0
+            for k in range(r + 1):
+                N6[r, k] = 0.0
+            for c in range(C):
+                if counts[c] == 0:
+                    continue
+                for k in range(r + 1):
+                    N6[r, k] += weights[c] * H[c, r, k]
+                r6[r] -= weights[c] * gains[c] * b[c, r]
+            if r < 3:
+                away = 0.0
+                for k in range(3):
+                    away += q_n[k, r] * (prior_X[n, k] - x_n[k])
+            else:
+                i, j = (r - 2) % 3, (r - 1) % 3  # ω_r = (R_ji − R_ij) / 2 of R = Qᵀ Q_prior
+                away = 0.0
+                for k in range(3):
+                    away += 0.5 * (q_n[k, j] * prior_Q[n, k, i] - q_n[k, i] * prior_Q[n, k, j])
+            N6[r, r] += 1 / (sd * sd)
+            r6[r] += away / (sd * sd)
+        if not solve_normal(N6, r6, L6, x6):
+            break
+        if last or step == iterations:
+            break
+        shift = math.sqrt(x6[0] ** 2 + x6[1] ** 2 + x6[2] ** 2)
+        turn = math.sqrt(x6[3] ** 2 + x6[4] ** 2 + x6[5] ** 2)
+        scale = min(1.0, 4 * size[n] / max(shift, 1e-12), 0.3 / max(turn, 1e-12))
+        for r in range(3):
+            x_n[r] += scale * (q_n[r, 0] * x6[0] + q_n[r, 1] * x6[1] + q_n[r, 2] * x6[2])
+        turn_by(q_n, scale * x6[3], scale * x6[4], scale * x6[5], q_new)
+        set_place(x_n, q_n, x_n, q_new)
+        last = shift < 0.01 * size[n] and turn < 1e-3
+    set_place(X[n], Q[n], best_x, best_q)
+    if iterations > 0 and L6[5, 5] > 0:
+        for r in range(6):
+            for k in range(6):
+                r6[k] = 1.0 if k == r else 0.0
+            if solve_normal(N6, r6, L6, x6):
+                covariance[n, r] = x6[r]
+
+
 @njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
 def align_patches(
     which,
@@ -145,6 +306,7 @@ def align_patches(
     Q,
     shape,
     size,
+    rows,
     templates,
     usable,
     use,
@@ -175,8 +337,10 @@ def align_patches(
     shape : (N, M, 5) float
     size : (N,) float
         What a pixel covers on the patch, metres: the unit in which steps are limited.
-    templates : (N, C, L, M, 3) float32
-    usable : (N, C, M) uint8
+    rows : (N,) int
+        Where the patches have their templates.
+    templates : (R, C, L, M, 3) float32
+    usable : (R, C, M) uint8
     use : (N, C) uint8
         Cameras to align with.
     images : (C, H, W) float32
@@ -201,135 +365,30 @@ def align_patches(
     covariance : (N, 6) float
         Filled: variances of shift (m²) and turn (rad²) along the patch's own axes; NaN without solution.
     """
-    M = shape.shape[1]
-    C = use.shape[1]
     for a in prange(len(which)):
-        n = which[a]
-        A = np.empty((C, 3, 4))
-        J = np.zeros((C, M, 6), np.float32)
-        T = np.empty((C, M), np.float32)
-        samples = np.empty((C, M), np.int64)
-        counts = np.zeros(C, np.int64)
-        variance_t = np.zeros(C)
-        H = np.zeros((C, 6, 6))
-        b = np.zeros((C, 6))
-        moments = np.zeros(1)
-        weights = np.zeros(C)
-        gains = np.zeros(C)
-        N6, L6 = np.zeros((6, 6)), np.zeros((6, 6))
-        r6, x6, local = np.zeros(6), np.zeros(6), np.zeros(3)
-        x_n, q_n, q_new = X[n].copy(), Q[n].copy(), np.zeros((3, 3))
-        best_x, best_q, best = x_n.copy(), q_n.copy(), -2.0
-        seen, last = 0, False
-        for c in range(C):
-            correlation[n, c] = -1.0
-            if not use[n, c]:
-                continue
-            local_camera(P[c], x_n, q_n, A[c])
-            for r in range(3):
-                local[r] = 0.0
-                for k in range(3):
-                    local[r] += q_n[k, r] * (centers[c, k] - x_n[k])
-            counts[c] = _prepare(
-                A[c],
-                local,
-                shape[n],
-                templates[n, c, level],
-                usable[n, c],
-                masks[c],
-                use_mask,
-                iterations > 0,
-                stride,
-                samples[c],
-                J[c],
-                T[c],
-                moments,
-            )
-            if counts[c] == 0:
-                continue
-            seen += 1
-            variance_t[c] = moments[0]
-            if iterations > 0:
-                for i in range(counts[c]):
-                    for r in range(6):
-                        for k in range(r + 1):
-                            H[c, r, k] += J[c, i, r] * J[c, i, k]
-        for r in range(6):
-            covariance[n, r] = np.nan
-        if seen == 0:
-            continue
-        now = np.full(C, -1.0)
-        for step in range(iterations + 1):
-            top, score, share = -1.0, 0.0, 0.0
-            for c in range(C):
-                if counts[c] == 0:
-                    continue
-                if step > 0:
-                    local_camera(P[c], x_n, q_n, A[c])
-                product, variance = _compare(
-                    A[c], shape[n], images[c], samples[c], counts[c], iterations > 0, J[c], T[c], b[c]
-                )
-                now[c] = product / math.sqrt(max(variance, 1e-3) * variance_t[c])
-                gains[c] = min(max(product / max(variance, 1e-3), 1 / _GAIN), _GAIN)
-                residual = max(variance_t[c] * (1 - now[c] * abs(now[c])), 0.0)
-                weights[c] = 1 / (residual * counts[c] / max(counts[c] - 8, 1) + _FLOOR**2)
-                top = max(top, now[c])
-            for c in range(C):
-                if counts[c] == 0:
-                    continue
-                if now[c] < least_correlation and now[c] < top - 0.05:
-                    weights[c] = 0.0
-                score += counts[c] * now[c]
-                share += counts[c]
-            score /= share
-            if score > best:
-                best = score
-                best_x[:], best_q[:] = x_n, q_n
-                for c in range(C):
-                    correlation[n, c] = now[c]
-            elif step > 2 and score < best - 0.1:
-                break
-            if iterations == 0:
-                break
-            # shared normal equations of all cameras, with the expected place as an observation
-            for r in range(6):
-                sd = prior_shift[n] if r < 3 else prior_turn[n]
-                r6[r] = 0.0
-                for k in range(r + 1):
-                    N6[r, k] = 0.0
-                for c in range(C):
-                    if counts[c] == 0:
-                        continue
-                    for k in range(r + 1):
-                        N6[r, k] += weights[c] * H[c, r, k]
-                    r6[r] -= weights[c] * gains[c] * b[c, r]
-                if r < 3:
-                    away = 0.0
-                    for k in range(3):
-                        away += q_n[k, r] * (prior_X[n, k] - x_n[k])
-                else:
-                    i, j = (r - 2) % 3, (r - 1) % 3  # ω_r = (R_ji − R_ij) / 2 of R = Qᵀ Q_prior
-                    away = 0.0
-                    for k in range(3):
-                        away += 0.5 * (q_n[k, j] * prior_Q[n, k, i] - q_n[k, i] * prior_Q[n, k, j])
-                N6[r, r] += 1 / (sd * sd)
-                r6[r] += away / (sd * sd)
-            if not solve_normal(N6, r6, L6, x6):
-                break
-            if last or step == iterations:
-                break
-            shift = math.sqrt(x6[0] ** 2 + x6[1] ** 2 + x6[2] ** 2)
-            turn = math.sqrt(x6[3] ** 2 + x6[4] ** 2 + x6[5] ** 2)
-            scale = min(1.0, 4 * size[n] / max(shift, 1e-12), 0.3 / max(turn, 1e-12))
-            for r in range(3):
-                x_n[r] += scale * (q_n[r, 0] * x6[0] + q_n[r, 1] * x6[1] + q_n[r, 2] * x6[2])
-            turn_by(q_n, scale * x6[3], scale * x6[4], scale * x6[5], q_new)
-            q_n[:] = q_new
-            last = shift < 0.01 * size[n] and turn < 1e-3
-        X[n], Q[n] = best_x, best_q
-        if iterations > 0 and L6[5, 5] > 0:
-            for r in range(6):
-                for k in range(6):
-                    r6[k] = 1.0 if k == r else 0.0
-                if solve_normal(N6, r6, L6, x6):
-                    covariance[n, r] = x6[r]
+        _align_one(
+            which[a],
+            X,
+            Q,
+            shape,
+            size,
+            rows,
+            templates,
+            usable,
+            use,
+            images,
+            level,
+            stride,
+            masks,
+            use_mask,
+            P,
+            centers,
+            prior_X,
+            prior_Q,
+            prior_shift,
+            prior_turn,
+            iterations,
+            least_correlation,
+            correlation,
+            covariance,
+        )

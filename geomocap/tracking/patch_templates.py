@@ -36,6 +36,15 @@ def local_camera(P, X, Q, A):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
+def set_place(X, Q, new_X, new_Q):
+    """Overwrite X (3,) and Q (3, 3)."""
+    for i in range(3):
+        X[i] = new_X[i]
+        for j in range(3):
+            Q[i, j] = new_Q[i, j]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
 def solve_normal(N, b, L, x):
     """Solve N x = b with N (6, 6) symmetric, lower triangle given; returns whether it is positive definite."""
     for i in range(6):
@@ -82,7 +91,7 @@ def turn_by(Q, w0, w1, w2, out):
 
 
 @njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
-def take_templates(X, Q, shape, want, levels, masks, P, templates, usable):
+def take_templates(X, Q, shape, rows, want, levels, masks, P, templates, usable):
     """Take templates of patches in the cameras where `want` is 1.
 
     Parameters
@@ -91,14 +100,16 @@ def take_templates(X, Q, shape, want, levels, masks, P, templates, usable):
         Places of the patches.
     shape : (N, M, 5) float
         Samples in the patch's frame and slopes of the surface: s, t, z, z_s, z_t.
+    rows : (N,) int
+        Where the patches have their templates.
     want : (N, C) uint8
         Set to 0 where too little is seen or the texture is too weak.
     levels : (L, C, H, W) float32
     masks : (C, H, W) uint8
     P : (C, 3, 4) float
-    templates : (N, C, L, M, 3) float32
+    templates : (R, C, L, M, 3) float32
         Filled with grey level and its slopes along s and t, per metre.
-    usable : (N, C, M) uint8
+    usable : (R, C, M) uint8
         Filled with 1 where the sample was seen.
     """
     N, C = want.shape
@@ -107,13 +118,14 @@ def take_templates(X, Q, shape, want, levels, masks, P, templates, usable):
     M = shape.shape[1]
     for n in prange(N):
         A = np.empty((3, 4))
+        row = rows[n]
         for c in range(C):
             if not want[n, c]:
                 continue
             local_camera(P[c], X[n], Q[n], A)
             count, total, square = 0, 0.0, 0.0
             for q in range(M):
-                usable[n, c, q] = 0
+                usable[row, c, q] = 0
                 s, t, z, zs, zt = shape[n, q, 0], shape[n, q, 1], shape[n, q, 2], shape[n, q, 3], shape[n, q, 4]
                 w = A[2, 0] * s + A[2, 1] * t + A[2, 2] * z + A[2, 3]
                 if w <= 0:
@@ -124,7 +136,7 @@ def take_templates(X, Q, shape, want, levels, masks, P, templates, usable):
                     continue
                 if masks[c, int(y + 0.5), int(x + 0.5)] == 0:
                     continue
-                usable[n, c, q] = 1
+                usable[row, c, q] = 1
                 count += 1
                 # derivatives of the pixel by s, t, z
                 xs, ys = (A[0, 0] - x * A[2, 0]) / w, (A[1, 0] - y * A[2, 0]) / w
@@ -135,10 +147,10 @@ def take_templates(X, Q, shape, want, levels, masks, P, templates, usable):
                     value = bilinear(image, x, y)
                     gx = bilinear(image, x + 0.5, y) - bilinear(image, x - 0.5, y)
                     gy = bilinear(image, x, y + 0.5) - bilinear(image, x, y - 0.5)
-                    templates[n, c, level, q, 0] = value
-                    templates[n, c, level, q, 1] = gx * (xs + zs * xz) + gy * (ys + zs * yz)
-                    templates[n, c, level, q, 2] = gx * (xt + zt * xz) + gy * (yt + zt * yz)
-                value = templates[n, c, L - 1, q, 0]
+                    templates[row, c, level, q, 0] = value
+                    templates[row, c, level, q, 1] = gx * (xs + zs * xz) + gy * (ys + zs * yz)
+                    templates[row, c, level, q, 2] = gx * (xt + zt * xz) + gy * (yt + zt * yz)
+                value = templates[row, c, L - 1, q, 0]
                 total += value
                 square += value * value
             if count < LEAST_SAMPLES * M or square / count - (total / count) ** 2 < LEAST_VARIANCE:

@@ -125,12 +125,13 @@ def _taken(state: Followed | None) -> tuple[np.ndarray, np.ndarray]:
 def _bare(seeds: Followed) -> Followed:
     """Leave out the templates, which are taken again from the same frame: only who has one is kept."""
     patches = seeds.patches
-    N, C, L = patches.templates.shape[:3]
+    N, (C, L) = len(patches), patches.templates.shape[1:3]
     blank = Patches(
         patches.positions,
         patches.frames,
         patches.shape,
         patches.size,
+        np.arange(N),
         np.zeros((N, C, L, 0, 3), np.float32),
         np.zeros((N, C, 0), np.uint8),
         patches.has,

@@ -11,6 +11,7 @@ from geomocap.tracking.patch_kernel import align_patches
 from geomocap.tracking.patch_templates import take_templates
 
 _COARSE_STRIDE = 2  # of the samples, on blurred levels
+_OWN = ("positions", "frames", "shape", "size", "rows", "has", "hidden")
 
 
 @dataclass(frozen=True)
@@ -85,9 +86,11 @@ class Patches:
         Samples in the patch's frame and slopes of the surface there: s, t, z (m), ∂z/∂s, ∂z/∂t.
     size : (N,) float
         Spacing of the samples: about a pixel, metres.
-    templates : (N, C, L, M, 3) float32
+    rows : (N,) int
+        Where each has its templates in the next two arrays, which patches share with those they were selected from.
+    templates : (R, C, L, M, 3) float32
         Grey level and its slopes along s and t, for each camera and blur level.
-    usable : (N, C, M) uint8
+    usable : (R, C, M) uint8
         Samples that the template has.
     has : (N, C) bool
         Cameras with a template.
@@ -99,6 +102,7 @@ class Patches:
     frames: np.ndarray
     shape: np.ndarray
     size: np.ndarray
+    rows: np.ndarray
     templates: np.ndarray
     usable: np.ndarray
     has: np.ndarray
@@ -124,6 +128,7 @@ class Patches:
             np.array(frames, np.float64),
             shape,
             size,
+            np.arange(N),
             np.zeros((N, C, L, M, 3), np.float32),
             np.zeros((N, C, M), np.uint8),
             np.zeros((N, C), bool),
@@ -132,13 +137,15 @@ class Patches:
 
     def select(self, which: np.ndarray) -> Patches:
         """Return some of them, by a mask or by positions."""
-        return Patches(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
+        return replace(self, **{name: getattr(self, name)[which] for name in _OWN})
 
     def join(self, other: Patches) -> Patches:
-        """Return these followed by others."""
-        return Patches(
-            **{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)}
-        )
+        """Return these followed by others, without the templates of any that were left out."""
+        parts = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _OWN}
+        parts["rows"] = np.arange(len(self) + len(other))
+        for name in ("templates", "usable"):
+            parts[name] = np.concatenate([getattr(self, name)[self.rows], getattr(other, name)[other.rows]])
+        return Patches(**parts)
 
     def moved(self, positions: np.ndarray, frames: np.ndarray) -> Patches:
         """Return them at other places."""
@@ -167,8 +174,7 @@ def visible(
     facing : float
         Least cosine between normal and direction to the camera.
     """
-    _, depth = view.project(positions)
-    surface = view.surface_depth(positions)
+    depth, surface = view.depths(positions)
     return (facings(positions, frames[:, :, 2], view) > facing) & (
         depth - surface - np.nan_to_num(np.maximum(patches.hidden, 0.0)) < slack
     )
@@ -186,30 +192,21 @@ def with_templates(patches: Patches, want: np.ndarray, view: FrameViews) -> Patc
     The new patches share the large arrays of templates with those given, which have nothing in the places filled.
     """
     took = np.ascontiguousarray(want & ~patches.has, np.uint8)
-    templates, usable = patches.templates, patches.usable
     take_templates(
         patches.positions,
         patches.frames,
         patches.shape,
+        patches.rows,
         took,
         view.levels,
         view.masks,
         view.projections,
-        templates,
-        usable,
+        patches.templates,
+        patches.usable,
     )
     got = took != 0
-    hidden = view.project(patches.positions)[1] - view.surface_depth(patches.positions)
-    return Patches(
-        patches.positions,
-        patches.frames,
-        patches.shape,
-        patches.size,
-        templates,
-        usable,
-        patches.has | got,
-        np.where(got, hidden, patches.hidden),
-    )
+    depth, surface = view.depths(patches.positions)
+    return replace(patches, has=patches.has | got, hidden=np.where(got, depth - surface, patches.hidden))
 
 
 def align(
@@ -261,6 +258,7 @@ def align(
             Q,
             patches.shape,
             patches.size,
+            patches.rows,
             patches.templates,
             patches.usable,
             np.ascontiguousarray(use, np.uint8),

@@ -49,8 +49,9 @@ def reacquire(
         some.frames,
         some.shape,
         some.size,
-        np.ascontiguousarray(np.repeat(some.templates[rows, best][:, None], C, axis=1)),
-        np.ascontiguousarray(np.repeat(some.usable[rows, best][:, None], C, axis=1)),
+        rows,
+        np.ascontiguousarray(np.repeat(some.templates[some.rows, best][:, None], C, axis=1)),
+        np.ascontiguousarray(np.repeat(some.usable[some.rows, best][:, None], C, axis=1)),
         seen,
         some.hidden,
     )

@@ -48,13 +48,13 @@ def spread(points: np.ndarray, spacing: float, taken: np.ndarray, rng: np.random
     order = rng.permutation(np.flatnonzero(free))
     if not len(order):
         return order
-    near = cKDTree(points[order]).query_ball_point(points[order], spacing, return_sorted=False)
+    tree = cKDTree(points[order])
     dead = np.zeros(len(order), bool)
     keep = []
-    for i, neighbours in enumerate(near):
+    for i, point in enumerate(points[order]):
         if not dead[i]:
             keep.append(order[i])
-            dead[neighbours] = True
+            dead[tree.query_ball_point(point, spacing)] = True
     return np.sort(np.array(keep))
 
 
@@ -217,8 +217,9 @@ def _lock(
         patches.frames,
         patches.shape,
         patches.size,
-        np.ascontiguousarray(np.repeat(patches.templates[rows, reference][:, None], C, axis=1)),
-        np.ascontiguousarray(np.repeat(patches.usable[rows, reference][:, None], C, axis=1)),
+        rows,
+        np.ascontiguousarray(np.repeat(patches.templates[patches.rows, reference][:, None], C, axis=1)),
+        np.ascontiguousarray(np.repeat(patches.usable[patches.rows, reference][:, None], C, axis=1)),
         seen,
         patches.hidden,
     )
@@ -267,8 +268,8 @@ def _lock(
 
 def _seen(view: FrameViews, points: np.ndarray) -> np.ndarray:
     """Cameras in which nothing lies before points of the surface, (N, C) bool."""
-    depth = view.project(points)[1]
-    return depth - view.surface_depth(points) < _HULL_SLACK * view.voxel_size
+    depth, surface = view.depths(points)
+    return depth - surface < _HULL_SLACK * view.voxel_size
 
 
 def _outward(view: FrameViews, points: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from geomocap.silhouettes import (
     region_of_points,
     silhouette,
 )
-from geomocap.silhouettes.background import agreement
+from geomocap.silhouettes.background import add_agreeing, agreement
 from geomocap.silhouettes.evidence import background_evidence, shadow_evidence, smooth_evidence
 from geomocap.silhouettes.light import light_change
 
@@ -138,6 +138,23 @@ def test_light_change_is_found_with_the_subject_in_view(walk: Scene, model: Back
     grey = model.mean.mean(axis=(0, 1))
     expected = 1 + 0.06 * np.sin(2 * np.pi * 3 / 12 + np.arange(3))
     np.testing.assert_allclose(gain * grey + offset, expected * grey, atol=0.6)
+
+
+def test_frames_that_agree_with_the_plate_are_added_as_in_numpy() -> None:
+    rng = np.random.default_rng(3)
+    plate = rng.uniform(60, 200, (20, 30, 3)).astype(np.float32)
+    sigma = rng.uniform(1, 6, (20, 30)).astype(np.float32)
+    image = np.clip(0.9 * plate + 7 + rng.normal(0, 8, plate.shape), 0, 255).astype(np.uint8)
+    gain, offset = np.array([0.9, 0.88, 0.93]), np.array([7.0, 6.0, 8.0])
+    relit = ((np.arange(256)[:, None] - offset) / gain).astype(np.float32)
+    total, count = plate.copy(), np.ones(sigma.shape, np.float32)
+    add_agreeing(image, relit, plate, sigma, total, count)
+
+    value = ((image - offset) / gain).astype(np.float32)
+    agrees = np.abs(value - plate).max(axis=-1) < 3.0 * sigma
+    assert 0.2 < agrees.mean() < 0.8
+    np.testing.assert_array_equal(count, 1 + agrees)
+    np.testing.assert_array_equal(total, plate + value * agrees[..., None])
 
 
 def test_noise_is_measured(model: BackgroundModel) -> None:

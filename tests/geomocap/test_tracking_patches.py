@@ -44,8 +44,8 @@ def test_frame_views_have_depth_in_front_of_the_surface_and_no_background(scene,
     assert_allclose(np.linalg.norm(view.projections[:, 2, :3], axis=1), 1)
     top = np.array([[0.2, 0, 0]])  # faces camera 0
     depth = view.project(top)[1]
-    assert_allclose(view.surface_depth(top)[0, 0], depth[0, 0], atol=0.015)
-    assert np.isnan(view.surface_depth(np.array([[0.0, 0, 3]]))).all()
+    assert_allclose(view.depths(top)[1][0, 0], depth[0, 0], atol=0.015)
+    assert np.isnan(view.depths(np.array([[0.0, 0, 3]]))[1]).all()
     # the dark background (40) doesn't bleed into the rim
     rim = (view.masks > 0) & ~np.stack([binary_erosion(m) for m in view.masks])
     inside = (view.masks > 0) & ~rim
