@@ -13,6 +13,8 @@ from geomocap.segmentation.surface_graph import frames_looked_at
 _NEAREST = 6
 _FRAMES = 10
 _NEAR = 1.5  # spacings of the samples
+_BESIDE = 0.75  # of the narrower body
+_OUTLIERS = 0.02
 
 
 @dataclass(frozen=True)
@@ -27,14 +29,11 @@ class Border:
         Places in frame 0 of the samples of each body that are on the border.
     bodies : two (n, 3) float, metres, world
         Places in frame 0 of all samples of each body.
-    spacing : float, metres
-        Lasting distance of neighbouring samples.
     """
 
     gap: float
     sides: tuple[np.ndarray, np.ndarray]
     bodies: tuple[np.ndarray, np.ndarray]
-    spacing: float
 
     @property
     def middle(self) -> np.ndarray:
@@ -42,19 +41,33 @@ class Border:
         return 0.5 * (self.sides[0].mean(axis=0) + self.sides[1].mean(axis=0))
 
     def middle_along(self, point: np.ndarray, axis: np.ndarray) -> np.ndarray:
-        """Point of an axis in the middle of the part that both bodies reach along it, (3,), metres.
+        """Where on a hinge's axis the joint is, (3,), metres: the motion leaves that open, the bodies' shapes say it.
 
-        Of a hinge across the bodies, as of a lid, that is the middle of the narrower one; but a shaft or a turntable
-        goes on along its axis, away from where it is borne: there the border alone counts.
+        Where the bodies lie side by side along most of the narrower one, as a lid and its box or thigh and shank do,
+        the joint is in the middle of what they share. Otherwise one begins where the other ends: if the smaller one is
+        short along the axis against its radius, as a wheel or an upper arm, it turns about its own middle; a shaft or a
+        turret goes on along the axis, and the joint is where it is borne, at the border.
         """
-        border = _common_part([(side - point) @ axis for side in self.sides])
-        whole = _common_part([(body - point) @ axis for body in self.bodies])
-        low, high = whole if np.abs(np.subtract(whole, border)).max() <= 2.0 * _NEAR * self.spacing else border
-        return point + 0.5 * (low + high) * axis
+        ends = [_reach(body, point, axis) for body in self.bodies]
+        low, high = max(e[0] for e in ends), min(e[1] for e in ends)
+        lengths = [e[1] - e[0] for e in ends]
+        if high - low >= _BESIDE * min(lengths):
+            return point + 0.5 * (low + high) * axis
+        smaller = int(len(self.bodies[1]) < len(self.bodies[0]))
+        if lengths[smaller] < _radius(self.bodies[smaller], point, axis):
+            return point + 0.5 * sum(ends[smaller]) * axis
+        return point + ((self.middle - point) @ axis) * axis
 
 
-def _common_part(along: list[np.ndarray]) -> tuple[float, float]:
-    return max(float(a.min()) for a in along), min(float(a.max()) for a in along)
+def _reach(places: np.ndarray, point: np.ndarray, axis: np.ndarray) -> tuple[float, float]:
+    """From where to where places reach along an axis, metres from the point; a few outliers apart."""
+    low, high = np.quantile((places - point) @ axis, (_OUTLIERS, 1.0 - _OUTLIERS))
+    return float(low), float(high)
+
+
+def _radius(places: np.ndarray, point: np.ndarray, axis: np.ndarray) -> float:
+    """How far places reach from an axis, metres; a few outliers apart."""
+    return float(np.quantile(np.linalg.norm(np.cross(places - point, axis), axis=1), 1.0 - _OUTLIERS))
 
 
 def find_borders(bodies: MotionBodies, limit: float) -> dict[tuple[int, int], Border]:
@@ -94,7 +107,7 @@ def find_borders(bodies: MotionBodies, limit: float) -> dict[tuple[int, int], Bo
                 nearest.append(float(few[:3].mean()))
             gap = max(min(nearest) - 2.0 * spacing, 0.0)
             both = bodies.rest[members[a]], bodies.rest[members[b]]
-            borders[a, b] = Border(gap, (sides[0], sides[1]), both, spacing)
+            borders[a, b] = Border(gap, (sides[0], sides[1]), both)
     return {pair: border for pair, border in borders.items() if border.gap <= limit}
 
 

@@ -165,17 +165,24 @@ def test_joints_hinges_and_tree_of_a_chain(three, found):
         assert np.rad2deg(np.arccos(min(1.0, abs(joint.axis @ three.axes[true])))) < 1.0
 
 
-def test_hinges_are_in_the_middle_of_what_both_bodies_share_of_the_axis():
+def test_where_on_its_axis_a_hinge_is():
     rng = np.random.default_rng(12)
-    chest = rng.random((300, 3)) * [1.0, 0.5, 0.3]
+    chest = rng.random((400, 3)) * [1.0, 0.5, 0.3]
+    x, z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+
+    def middle(other, border, point, axis):
+        sides = chest[np.linalg.norm(chest - border, axis=1) < 0.3], other[np.linalg.norm(other - border, axis=1) < 0.3]
+        return Border(0.0, sides, (chest, other)).middle_along(np.array(point), axis)
+
+    # a lid beside the box: the lid's middle
     lid = rng.random((200, 3)) * [0.6, 0.5, 0.02] + [0.2, 0.0, 0.3]
-    along_edge = Border(0.0, (chest[chest[:, 1] < 0.1], lid[(lid[:, 1] < 0.1)]), (chest, lid), 0.05)
-    edge, x = np.array([0.1, 0.0, 0.3]), np.array([1.0, 0.0, 0.0])
-    np.testing.assert_allclose(along_edge.middle_along(edge, x), [0.5, 0.0, 0.3], atol=0.02)
+    np.testing.assert_allclose(middle(lid, [0.2, 0.0, 0.3], [0.1, 0.0, 0.3], x), [0.5, 0.0, 0.3], atol=0.02)
+    # a tower on top: where it stands
     tower = rng.random((200, 3)) * [0.2, 0.2, 1.0] + [0.4, 0.2, 0.3]
-    turntable = Border(0.0, (chest[chest[:, 2] > 0.28], tower[tower[:, 2] < 0.32]), (chest, tower), 0.05)
-    pivot, z = np.array([0.5, 0.3, 0.9]), np.array([0.0, 0.0, 1.0])
-    np.testing.assert_allclose(turntable.middle_along(pivot, z), [0.5, 0.3, 0.3], atol=0.02)
+    np.testing.assert_allclose(middle(tower, [0.5, 0.3, 0.3], [0.5, 0.3, 0.9], z), [0.5, 0.3, 0.3], atol=0.07)
+    # a wheel at the side: the wheel's middle
+    wheel = rng.random((200, 3)) * [0.1, 0.5, 0.5] + [1.0, 0.0, -0.1]
+    np.testing.assert_allclose(middle(wheel, [1.0, 0.25, 0.15], [0.3, 0.25, 0.15], x), [1.05, 0.25, 0.15], atol=0.02)
 
 
 def test_joints_stay_fixed_in_both_bodies_and_follow_forward_kinematics(found):
