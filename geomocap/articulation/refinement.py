@@ -6,14 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
-from scipy.spatial.transform import Rotation
 
 from geomocap.articulation.adjustment import JointPrior, adjust
+from geomocap.articulation.hinges import find_hinges, turn_information
 from geomocap.articulation.kinematics import (
     BodyMotion,
     JointMotion,
     Linkage,
-    about_axis,
     body_motion,
     joint_motion,
     posed,
@@ -49,9 +48,6 @@ class RefinementSettings(Settings):
     )
     blend_sigma: float = Field(
         default=1e-3, gt=0, description="misfit that is worth a change of the skin weights by one (extents)"
-    )
-    hinge_slack_deg: float = Field(
-        default=0.5, ge=0, description="hinges that turn more about other axes (rms) may do so, as balls (degrees)"
     )
     least_turn_deg: float = Field(
         default=0.3, gt=0, description="least scale of the turning accelerations (degrees/frame²)"
@@ -107,7 +103,7 @@ def refine_skeleton(
     settings = settings or RefinementSettings()
     if settings.rounds == 0:
         return found, bodies
-    linkage, motion = linkage_of(found, settings.hinge_slack_deg)
+    linkage, motion = linkage_of(found)
     points = SkinPoints.of_weights(bodies.rest, bodies.weights)
     refined = refine_motion(linkage, motion, points, paths, bodies.extent, settings)
     bodies = replace(
@@ -128,27 +124,25 @@ def refine_skeleton(
         found.skeleton.fps,
     )
     joints = tuple(
-        replace(joint, point=point, axis=axis)
-        for joint, point, axis in zip(found.joints, refined.linkage.joints, refined.linkage.axes, strict=True)
+        replace(joint, point=point, axis=axis, hinge=bool(hinge))
+        for joint, point, axis, hinge in zip(
+            found.joints, refined.linkage.joints, refined.linkage.axes, refined.linkage.hinge, strict=True
+        )
     )
     return MotionSkeleton(skeleton, joints, found.costs), bodies
 
 
-def linkage_of(found: MotionSkeleton, hinge_slack_deg: float) -> tuple[Linkage, JointMotion]:
-    """Linkage of a skeleton, and its motion.
-
-    Only hinges that turn less than the slack about other axes are hinges to the letter: an elbow is none, and forced to
-    be one it would bend its neighbours' motion.
-    """
+def linkage_of(found: MotionSkeleton) -> tuple[Linkage, JointMotion]:
+    """Linkage of a skeleton, all joints balls, and its motion."""
     skeleton = found.skeleton
-    hierarchy = skeleton.hierarchy
     axes = np.array([joint.axis / np.linalg.norm(joint.axis) for joint in found.joints]).reshape(-1, 3)
-    hinge = np.zeros(len(axes), bool)
-    for j, (_, child) in enumerate(hierarchy.joint_bodies):
-        relative = skeleton.local_rotations[:, child]
-        swing = Rotation.from_matrix(relative @ about_axis(relative, axes[j]).swapaxes(1, 2)).magnitude()
-        hinge[j] = found.joints[j].hinge and np.sqrt((swing**2).mean()) <= np.deg2rad(hinge_slack_deg)
-    linkage = Linkage(hierarchy, skeleton.joint_positions[0], axes, hinge, skeleton.body_positions[0, skeleton.root])
+    linkage = Linkage(
+        skeleton.hierarchy,
+        skeleton.joint_positions[0],
+        axes,
+        np.zeros(len(axes), bool),
+        skeleton.body_positions[0, skeleton.root],
+    )
     return linkage, joint_motion(linkage, skeleton.body_rotations, skeleton.body_positions[:, skeleton.root])
 
 
@@ -191,6 +185,9 @@ def refine_motion(
             points = fit_shares(points, bodies, paths.positions, trust, near, pull)
         points = _settled(points, bodies, paths, settings.cutoff * sigma)
         sigma = _sample_sigma(bodies, points, paths, least)
+        if k == settings.rounds - 1:
+            linkage = _with_hinges(linkage, motion, bodies, points, paths, sigma, settings.independence)
+            motion = joint_motion(linkage, bodies.rotations, motion.root)
         # Motion and joints of the shape so far
         spread = np.broadcast_to(sigma[:, None] / np.sqrt(settings.independence), paths.seen.shape)
         adjusted = adjust(
@@ -206,6 +203,22 @@ def refine_motion(
         linkage, motion, bodies = adjusted.linkage, adjusted.motion, adjusted.bodies
     first = bodies.part(slice(0, 1)).carry(points.rest, points.bodies, points.shares)[0]
     return RefinedMotion(posed(linkage, bodies, 0), since(bodies, 0), replace(points, rest=first), sigma)
+
+
+def _with_hinges(
+    linkage: Linkage,
+    motion: JointMotion,
+    bodies: BodyMotion,
+    points: SkinPoints,
+    paths: MotionPaths,
+    sigma: np.ndarray,
+    independence: float,
+) -> Linkage:
+    """Linkage whose hinges are those that the sightings can't tell from hinges."""
+    information = turn_information(linkage, bodies, points, paths.seen, independence / sigma**2)
+    shown = np.bincount(points.body, paths.seen.sum(axis=1), linkage.body_count)
+    sightings = independence * shown[linkage.hierarchy.joint_bodies].sum(axis=1)
+    return find_hinges(linkage, motion, information, sightings)
 
 
 def smoothness_of(linkage: Linkage, motion: JointMotion, extent: float, settings: RefinementSettings) -> Smoothness:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydantic import Field
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from geomocap.articulation.adjustment import adjust
@@ -23,12 +22,15 @@ from geomocap.articulation.surface_matching import (
     distance_between,
     match_surfaces,
 )
+from geomocap.articulation.take_paths import attach_paths, turned_by_paths
 from geomocap.errors import GeometryError
 from geomocap.progress import Progress, silent
 from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.settings import Settings
 
 _STAGE = "model"
+_REACH = 3.0  # standard deviations of the surface
+_NOISE = 2e-4  # extents
 
 
 class TakeSettings(Settings):
@@ -178,12 +180,17 @@ def _fit_all(
     """Motion of all frames that fits surfaces and paths best, evenly in time."""
     linkage = model.linkage
     count = len(surface.skin)
+    reach = _REACH * scales.sigma
+    if paths is not None:
+        bodies = body_motion(linkage, motion)
+        skin = attach_paths(model, bodies, paths, reach)
+        motion = turned_by_paths(linkage, motion, bodies, skin, paths, _NOISE * model.extent)
     for _ in range(settings.rounds):
         bodies = body_motion(linkage, motion)
         points = surface.skin
         sightings = match_surfaces(surface, surface.posed(bodies), views, scales)
         if paths is not None:
-            skin = attach_paths(model, bodies, paths, 3.0 * scales.sigma)
+            skin = attach_paths(model, bodies, paths, reach)
             points = SkinPoints(*(np.concatenate([getattr(points, n), getattr(skin, n)]) for n in _SKIN))
             sigma = np.hypot(paths.typical_sigma(), 0.2 * scales.sigma) / np.sqrt(settings.path_independence)
             spread = np.broadcast_to(sigma[:, None], paths.seen.shape)
@@ -200,38 +207,3 @@ def _smoothness(linkage: Linkage, motion: JointMotion, extent: float, settings: 
     turn, shift = typical_accelerations(linkage, motion)
     least = np.deg2rad(settings.least_turn_deg)
     return Smoothness(np.maximum(turn, least), max(shift, settings.least_shift * extent), 3.0)
-
-
-def attach_paths(model: SubjectModel, bodies: BodyMotion, paths: MotionPaths, reach: float) -> SkinPoints:
-    """Places and skin weights, at rest, of points that were tracked on the subject.
-
-    A point takes the weights of the model's nearest one in the frame in the middle of its life, and the place at rest
-    that its sightings have in the median when they are carried back.
-
-    Parameters
-    ----------
-    model : SubjectModel
-    bodies : BodyMotion
-        The model's in the take.
-    paths : MotionPaths
-    reach : float, metres
-        A point that is farther from the model than this, in the median, follows it at the place of the nearest point.
-    """
-    skin = model.skin
-    seen = paths.seen
-    middle = np.array([np.flatnonzero(s)[s.sum() // 2] for s in seen])
-    nearest = np.zeros(paths.count, int)
-    for t in np.unique(middle):
-        mine = np.flatnonzero(middle == t)
-        placed = bodies.part(slice(t, t + 1)).carry(skin.rest, skin.bodies, skin.shares)[0]
-        nearest[mine] = cKDTree(placed).query(paths.positions[mine, t])[1]
-    owners, shares = skin.bodies[nearest], skin.shares[nearest]
-    matrix, offset = np.zeros((len(bodies.rotations), paths.count, 3, 3)), 0.0
-    for k in range(owners.shape[1]):
-        matrix += shares[:, k, None, None] * bodies.rotations[:, owners[:, k]]
-        offset = offset + shares[:, k, None] * bodies.translations[:, owners[:, k]]
-    away = np.where(seen[..., None], paths.positions, 0.0).swapaxes(0, 1) - offset
-    back = np.linalg.solve(matrix, away[..., None])[..., 0].swapaxes(0, 1)
-    rest = np.nanmedian(np.where(seen[..., None], back, np.nan), axis=1)
-    far = np.linalg.norm(rest - skin.rest[nearest], axis=1) > reach
-    return SkinPoints(np.where(far[:, None], skin.rest[nearest], rest), owners, shares)

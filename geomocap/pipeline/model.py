@@ -6,7 +6,6 @@ import numpy as np
 
 from geomocap.articulation.model import MODEL_FILE, SubjectModel
 from geomocap.articulation.model_building import BodyCloud, build_model
-from geomocap.articulation.refinement import linkage_of
 from geomocap.errors import GeometryError
 from geomocap.geometry import BodyPoints, Geometry
 from geomocap.pipeline.job import Job
@@ -23,10 +22,10 @@ def make_model(job: Job, geometry: Geometry, found: MotionSkeleton, bodies: Moti
         colors = geometry.features(frame) if geometry.features is not None else None
         return BodyCloud(labelled.positions, labelled.body, colors)
 
-    linkage, _ = linkage_of(found, job.config.refinement.hinge_slack_deg)
+    hinge = np.array([joint.hinge for joint in found.joints], dtype=bool)
     try:
         with job.run.timed("model") as count:
-            model = build_model(found, bodies, np.asarray(linkage.hinge), read, geometry.spacing)
+            model = build_model(found, bodies, hinge, read, geometry.spacing)
             count["items"] = len(model.points)
     except GeometryError as error:
         write_warnings(job.run, [str(error)])

@@ -8,7 +8,8 @@ from geomocap.articulation.model import SubjectModel, rotation_limits
 from geomocap.articulation.observations import Observations
 from geomocap.articulation.smoothness import PosePrior
 from geomocap.articulation.surface_matching import FrameSurface, MatchingScales, ModelSurface, match_surfaces
-from geomocap.articulation.take_tracking import TakeSettings, attach_paths, track_take
+from geomocap.articulation.take_paths import attach_paths, turned_by_paths
+from geomocap.articulation.take_tracking import TakeSettings, track_take
 from geomocap.config import Config
 from geomocap.errors import GeometryError
 from geomocap.pipeline.job import Job
@@ -126,6 +127,40 @@ def test_tracked_points_are_hung_on_the_model(model):
     seen[::2, :6] = np.nan
     skin = attach_paths(model, true, MotionPaths(seen), 0.05)
     np.testing.assert_allclose(skin.rest, model.points[some], atol=1e-9)
+
+
+def rolled(model, true, about):
+    """The motion with a head that rolls about its own length as the surface, nearly round, can't see."""
+    local = np.tile(np.eye(3), (len(true.rotations), 3, 1, 1))
+    local[:, 0] = true.rotations[:, 0]
+    for child in (1, 2):
+        local[:, child] = np.swapaxes(true.rotations[:, 0], 1, 2) @ true.rotations[:, child]
+    local[:, 2] = local[:, 2] @ Rotation.from_rotvec(np.outer(about, [0.0, 0.45, 0.89])).as_matrix()
+    root = true.rotations[:, 0] @ model.origin + true.translations[:, 0]
+    motion = JointMotion(local, root)
+    return motion, body_motion(model.linkage, motion)
+
+
+def test_tracked_points_turn_the_bodies_where_the_surface_does_not(model):
+    true, places = take_of(model)
+    some = np.random.default_rng(3).permutation(len(model.points))[:700]
+    seen = places[:, some].swapaxes(0, 1).copy()
+    seen[::3, :5] = seen[1::3, 8:] = np.nan
+    paths = MotionPaths(seen)
+    motion, bodies = rolled(model, true, np.linspace(-0.6, 0.6, len(places)))
+    skin = attach_paths(model, bodies, paths, 0.05)
+    found = body_motion(model.linkage, turned_by_paths(model.linkage, motion, bodies, skin, paths, 1e-4))
+    # the turns since frame 0 are those of the points; the surface alone was wrong by up to 69°
+    turns = [np.swapaxes(m.rotations @ m.rotations[0].swapaxes(1, 2), -1, -2) for m in (found, true)]
+    assert np.rad2deg(turn_angles(turns[0] @ np.swapaxes(turns[1], -1, -2))).max() < 2.0
+
+
+def test_tracked_points_follow_the_body_that_carries_them(model):
+    true, places = take_of(model)
+    arm = np.flatnonzero((model.skin.body == 1) & (model.points[:, 0] < 0.2))[::5]
+    seen = places[:, arm].swapaxes(0, 1)
+    # beside the shoulder, the trunk's points are as near, but only the arm's move along
+    assert (attach_paths(model, true, MotionPaths(seen), 0.05).body == 1).mean() > 0.95
 
 
 def test_pose_prior_holds_what_nothing_is_seen_of(model):
