@@ -11,6 +11,7 @@ from geomocap.articulation.kinematics import BodyMotion, JointMotion, Linkage, a
 from geomocap.articulation.observations import SkinPoints
 
 _ROUNDS = 5
+_TILT = 1e-4  # radians, for slopes
 
 
 def turn_information(
@@ -48,8 +49,8 @@ def turn_information(
 def find_hinges(linkage: Linkage, motion: JointMotion, information: np.ndarray, sightings: np.ndarray) -> Linkage:
     """Linkage in which those joints are hinges whose turns about other axes the sightings don't show.
 
-    A ball has two degrees of freedom more in each frame, a hinge two for its axis: by the Bayesian information criterion
-    it is a hinge if Σ φᵀ I φ over the turns φ about other axes is less than (2 T - 2) log n.
+    A ball has two degrees of freedom more in each frame, a hinge has two for its axis. By the Bayesian information
+    criterion it is a hinge if Σ φᵀ I φ over the turns φ about other axes is less than (2 T - 2) log n.
 
     Parameters
     ----------
@@ -98,9 +99,6 @@ def hinge_axis(turns: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, 
         axis = axis + np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(2) + 1e-12 * np.eye(2), right) @ across
         axis /= np.linalg.norm(axis)
     return axis, _off_axis(turns, axis)
-
-
-_TILT = 1e-4
 
 
 def _tilted(axis: np.ndarray, across: np.ndarray) -> np.ndarray:

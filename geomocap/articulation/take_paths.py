@@ -64,9 +64,9 @@ def attach_paths(model: SubjectModel, bodies: BodyMotion, paths: MotionPaths, re
 def _nearest_points(skin: SkinPoints, bodies: BodyMotion, paths: MotionPaths) -> np.ndarray:
     """The model's points nearest to each path in frames spread over its life, (N, looks) int."""
     asked = np.empty((paths.count, _LOOKS), int)
-    for n, row in enumerate(paths.seen):
+    for path, row in enumerate(paths.seen):
         frames = np.flatnonzero(row)
-        asked[n] = frames[np.linspace(0, len(frames) - 1, _LOOKS).round().astype(int)]
+        asked[path] = frames[np.linspace(0, len(frames) - 1, _LOOKS).round().astype(int)]
     nearest = np.empty_like(asked)
     for t in np.unique(asked):
         n, k = np.nonzero(asked == t)
