@@ -29,6 +29,101 @@ def _add_block(block: np.ndarray, x: np.ndarray, y: np.ndarray, weight: np.ndarr
             block[i, j] += sx[0, i] * w0 + sx[1, i] * w1 + sx[2, i] * w2
 
 
+@njit(cache=True, nogil=True)
+def _frame_equations(
+    t,
+    rotations,
+    translations,
+    twists,
+    chain,
+    chain_start,
+    points,
+    bodies,
+    shares,
+    start,
+    point,
+    target,
+    normal,
+    isotropic,
+    across,
+    cutoff,
+    matrix,
+    right,
+):
+    """Fill matrix (K, K) and right (K,) of frame t and return its cost; other parameters as of `normal_equations`."""
+    count = rotations.shape[1]
+    unknowns = twists.shape[1]
+    most = bodies.shape[1]
+    cost = 0.0
+    blocks = np.zeros((count, count, 6, 6))
+    used = np.zeros((count, count), np.bool_)
+    forces = np.zeros((count, 6))
+    x = np.zeros((most, 3))
+    weight = np.zeros((3, 3))
+    miss = np.zeros(3)
+    force = np.zeros(3)
+    for m in range(start[t], start[t + 1]):
+        p = point[m]
+        for i in range(3):
+            miss[i] = target[m, i]
+        for k in range(most):
+            share = shares[p, k]
+            if share == 0.0:
+                continue
+            b = bodies[p, k]
+            for i in range(3):
+                x[k, i] = translations[t, b, i]
+                for j in range(3):
+                    x[k, i] += rotations[t, b, i, j] * points[p, j]
+                miss[i] -= share * x[k, i]
+        along = miss[0] * normal[m, 0] + miss[1] * normal[m, 1] + miss[2] * normal[m, 2]
+        chi2 = isotropic[m] * (miss[0] ** 2 + miss[1] ** 2 + miss[2] ** 2) + across[m] * along**2
+        cost += 0.5 * cutoff**2 * np.log(1.0 + chi2 / cutoff**2)
+        robust = 1.0 / (1.0 + chi2 / cutoff**2)
+        for i in range(3):
+            for j in range(3):
+                weight[i, j] = robust * across[m] * normal[m, i] * normal[m, j]
+            weight[i, i] += robust * isotropic[m]
+        for i in range(3):
+            force[i] = weight[i, 0] * miss[0] + weight[i, 1] * miss[1] + weight[i, 2] * miss[2]
+        for k in range(most):
+            share = shares[p, k]
+            if share == 0.0:
+                continue
+            b = bodies[p, k]
+            forces[b, 0] += share * (x[k, 1] * force[2] - x[k, 2] * force[1])
+            forces[b, 1] += share * (x[k, 2] * force[0] - x[k, 0] * force[2])
+            forces[b, 2] += share * (x[k, 0] * force[1] - x[k, 1] * force[0])
+            for i in range(3):
+                forces[b, 3 + i] += share * force[i]
+            for n in range(most):
+                other = shares[p, n]
+                if other != 0.0:
+                    c = bodies[p, n]
+                    used[b, c] = True
+                    _add_block(blocks[b, c], x[k], x[n], weight, share * other)
+    carried = np.zeros((unknowns, 6))
+    for b in range(count):
+        for u in chain[chain_start[b] : chain_start[b + 1]]:
+            for i in range(6):
+                right[u] += twists[t, u, i] * forces[b, i]
+        for c in range(count):
+            if not used[b, c]:
+                continue
+            for u in chain[chain_start[b] : chain_start[b + 1]]:
+                for j in range(6):
+                    carried[u, j] = 0.0
+                    for i in range(6):
+                        carried[u, j] += twists[t, u, i] * blocks[b, c, i, j]
+            for u in chain[chain_start[b] : chain_start[b + 1]]:
+                for w in chain[chain_start[c] : chain_start[c + 1]]:
+                    value = 0.0
+                    for i in range(6):
+                        value += carried[u, i] * twists[t, w, i]
+                    matrix[u, w] += value
+    return cost
+
+
 @njit(cache=True, nogil=True, parallel=True)
 def normal_equations(
     rotations: np.ndarray,
@@ -79,77 +174,30 @@ def normal_equations(
     cost : (T,) float
         Half the sum of cutoff² log(1 + χ² / cutoff²).
     """
-    frames, count = rotations.shape[0], rotations.shape[1]
+    frames = rotations.shape[0]
     unknowns = twists.shape[1]
-    most = bodies.shape[1]
     matrix = np.zeros((frames, unknowns, unknowns))
     right = np.zeros((frames, unknowns))
     cost = np.zeros(frames)
     for t in prange(frames):
-        blocks = np.zeros((count, count, 6, 6))
-        used = np.zeros((count, count), np.bool_)
-        forces = np.zeros((count, 6))
-        x = np.zeros((most, 3))
-        weight = np.zeros((3, 3))
-        miss = np.zeros(3)
-        force = np.zeros(3)
-        for m in range(start[t], start[t + 1]):
-            p = point[m]
-            for i in range(3):
-                miss[i] = target[m, i]
-            for k in range(most):
-                share = shares[p, k]
-                if share == 0.0:
-                    continue
-                b = bodies[p, k]
-                for i in range(3):
-                    x[k, i] = translations[t, b, i]
-                    for j in range(3):
-                        x[k, i] += rotations[t, b, i, j] * points[p, j]
-                    miss[i] -= share * x[k, i]
-            along = miss[0] * normal[m, 0] + miss[1] * normal[m, 1] + miss[2] * normal[m, 2]
-            chi2 = isotropic[m] * (miss[0] ** 2 + miss[1] ** 2 + miss[2] ** 2) + across[m] * along**2
-            cost[t] += 0.5 * cutoff**2 * np.log(1.0 + chi2 / cutoff**2)
-            robust = 1.0 / (1.0 + chi2 / cutoff**2)
-            for i in range(3):
-                for j in range(3):
-                    weight[i, j] = robust * across[m] * normal[m, i] * normal[m, j]
-                weight[i, i] += robust * isotropic[m]
-            for i in range(3):
-                force[i] = weight[i, 0] * miss[0] + weight[i, 1] * miss[1] + weight[i, 2] * miss[2]
-            for k in range(most):
-                share = shares[p, k]
-                if share == 0.0:
-                    continue
-                b = bodies[p, k]
-                forces[b, 0] += share * (x[k, 1] * force[2] - x[k, 2] * force[1])
-                forces[b, 1] += share * (x[k, 2] * force[0] - x[k, 0] * force[2])
-                forces[b, 2] += share * (x[k, 0] * force[1] - x[k, 1] * force[0])
-                for i in range(3):
-                    forces[b, 3 + i] += share * force[i]
-                for n in range(most):
-                    other = shares[p, n]
-                    if other != 0.0:
-                        c = bodies[p, n]
-                        used[b, c] = True
-                        _add_block(blocks[b, c], x[k], x[n], weight, share * other)
-        carried = np.zeros((unknowns, 6))
-        for b in range(count):
-            for u in chain[chain_start[b] : chain_start[b + 1]]:
-                for i in range(6):
-                    right[t, u] += twists[t, u, i] * forces[b, i]
-            for c in range(count):
-                if not used[b, c]:
-                    continue
-                for u in chain[chain_start[b] : chain_start[b + 1]]:
-                    for j in range(6):
-                        carried[u, j] = 0.0
-                        for i in range(6):
-                            carried[u, j] += twists[t, u, i] * blocks[b, c, i, j]
-                for u in chain[chain_start[b] : chain_start[b + 1]]:
-                    for w in chain[chain_start[c] : chain_start[c + 1]]:
-                        value = 0.0
-                        for i in range(6):
-                            value += carried[u, i] * twists[t, w, i]
-                        matrix[t, u, w] += value
+        cost[t] = _frame_equations(
+            np.int64(t),
+            rotations,
+            translations,
+            twists,
+            chain,
+            chain_start,
+            points,
+            bodies,
+            shares,
+            start,
+            point,
+            target,
+            normal,
+            isotropic,
+            across,
+            cutoff,
+            matrix[t],
+            right[t],
+        )
     return matrix, right, cost

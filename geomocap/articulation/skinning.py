@@ -70,6 +70,67 @@ def candidates_near(linkage: Linkage, points: SkinPoints) -> np.ndarray:
     return result
 
 
+@numba.njit(cache=True, nogil=True)
+def _fit_one(n, rest, rotations, translations, positions, weights, candidates, present, pull, result):
+    """Fill the shares of point n."""
+    bodies = np.empty(candidates.shape[1], np.int64)
+    k = 0
+    for c in range(candidates.shape[1]):
+        if candidates[n, c] >= 0:
+            bodies[k] = candidates[n, c]
+            k += 1
+    gram = np.zeros((k, k))
+    away = np.zeros((k, 3))  # seen minus carried: Σ w away is what is left, as Σ w = 1
+    total = 1e-12
+    for t in range(weights.shape[1]):
+        w = weights[n, t]
+        if w == 0.0:
+            continue
+        total += w
+        for a in range(k):
+            for i in range(3):
+                away[a, i] = positions[n, t, i] - translations[t, bodies[a], i]
+                for j in range(3):
+                    away[a, i] -= rotations[t, bodies[a], i, j] * rest[n, j]
+            for b in range(a + 1):
+                product = away[a, 0] * away[b, 0] + away[a, 1] * away[b, 1] + away[a, 2] * away[b, 2]
+                gram[a, b] += w * product
+    share = np.zeros(k)
+    linear = np.zeros(k)
+    for a in range(k):
+        for b in range(a + 1):
+            gram[a, b] /= total
+            gram[b, a] = gram[a, b]
+        gram[a, a] += pull[n]
+        linear[a] = pull[n] * present[n, bodies[a]]
+        share[a] = present[n, bodies[a]]
+    amount = 0.0
+    for a in range(k):
+        amount += share[a]
+    if amount <= 0.0:
+        share[0] = amount = 1.0
+    for a in range(k):
+        share[a] /= amount
+    for _ in range(_SWEEPS):  # mass goes from one body to another, as much as is best
+        moved = 0.0
+        for a in range(k):
+            for b in range(a):
+                slope = linear[a] - linear[b]
+                for c in range(k):
+                    slope -= (gram[a, c] - gram[b, c]) * share[c]
+                curve = gram[a, a] + gram[b, b] - 2.0 * gram[a, b]
+                if curve <= 1e-18:
+                    continue
+                step = min(max(slope / curve, -share[a]), share[b])
+                share[a] += step
+                share[b] -= step
+                moved = max(moved, abs(step))
+        if moved < 1e-4:
+            break
+    for a in range(k):
+        result[n, bodies[a]] = share[a]
+
+
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _fit_shares(
     rest: np.ndarray,
@@ -81,56 +142,7 @@ def _fit_shares(
     present: np.ndarray,
     pull: np.ndarray,
 ) -> np.ndarray:
-    count, frames = weights.shape
     result = np.zeros(present.shape)
-    for n in numba.prange(count):
-        bodies = candidates[n][candidates[n] >= 0]
-        k = len(bodies)
-        gram = np.zeros((k, k))
-        away = np.zeros((k, 3))  # seen minus carried: Σ w away is what is left, as Σ w = 1
-        total = 1e-12
-        for t in range(frames):
-            w = weights[n, t]
-            if w == 0.0:
-                continue
-            total += w
-            for a in range(k):
-                for i in range(3):
-                    away[a, i] = positions[n, t, i] - translations[t, bodies[a], i]
-                    for j in range(3):
-                        away[a, i] -= rotations[t, bodies[a], i, j] * rest[n, j]
-                for b in range(a + 1):
-                    product = away[a, 0] * away[b, 0] + away[a, 1] * away[b, 1] + away[a, 2] * away[b, 2]
-                    gram[a, b] += w * product
-        share = np.zeros(k)
-        linear = np.zeros(k)
-        for a in range(k):
-            for b in range(a + 1):
-                gram[a, b] /= total
-                gram[b, a] = gram[a, b]
-            gram[a, a] += pull[n]
-            linear[a] = pull[n] * present[n, bodies[a]]
-            share[a] = present[n, bodies[a]]
-        amount = share.sum()
-        if amount <= 0.0:
-            share[0] = amount = 1.0
-        share /= amount
-        for _ in range(_SWEEPS):  # mass goes from one body to another, as much as is best
-            moved = 0.0
-            for a in range(k):
-                for b in range(a):
-                    slope = linear[a] - linear[b]
-                    for c in range(k):
-                        slope -= (gram[a, c] - gram[b, c]) * share[c]
-                    curve = gram[a, a] + gram[b, b] - 2.0 * gram[a, b]
-                    if curve <= 1e-18:
-                        continue
-                    step = min(max(slope / curve, -share[a]), share[b])
-                    share[a] += step
-                    share[b] -= step
-                    moved = max(moved, abs(step))
-            if moved < 1e-4:
-                break
-        for a in range(k):
-            result[n, bodies[a]] = share[a]
+    for n in numba.prange(len(weights)):
+        _fit_one(np.int64(n), rest, rotations, translations, positions, weights, candidates, present, pull, result)
     return result

@@ -1,4 +1,4 @@
-"""What the bodies are found from: patches followed in the images, nodes followed on the geometry, or both together."""
+"""What the bodies are found from: patches followed in the images, nodes on the geometry, both, or ellipsoids."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import numpy as np
 from geomocap.errors import GeometryError
 from geomocap.geometry import Geometry
 from geomocap.pipeline.job import Job
+from geomocap.segmentation.m3 import ellipsoid_paths
 from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.tracking.nodes import track_nodes
 from geomocap.tracking.selection import spread_out
@@ -19,7 +20,7 @@ ANCHOR_SHARE = 0.1  # those are measured in this share of the frames at least
 
 
 def motion_paths(job: Job, geometry: Geometry) -> tuple[MotionPaths, str]:
-    """Motion paths and what they are: "patches", "nodes", or "both", nodes with patches as anchors.
+    """Motion paths and what they are: "patches", "nodes", "both" (nodes with patches as anchors) or "ellipsoids".
 
     Raises
     ------
@@ -27,6 +28,10 @@ def motion_paths(job: Job, geometry: Geometry) -> tuple[MotionPaths, str]:
         If patches are asked for and there are none.
     """
     wanted = job.config.segmentation.paths
+    if wanted == "ellipsoids":
+        settings = job.config.segmentation
+        found = ellipsoid_paths(geometry.points, len(geometry), geometry.spacing, settings, job.executor, job.progress)
+        return MotionPaths(found.ellipsoids.centers.swapaxes(0, 1)), wanted
     tracked = None
     if wanted != "nodes" and (job.run.path / "tracks.npz").exists():
         tracked = job.run.read_npz("tracks.npz")

@@ -30,7 +30,7 @@ def segment(job: Job, source: Source) -> str:
     by_motion = config.segmentation.method == "motion" and len(geometry) > 1
     settings: dict[str, Any] = {"segmentation": config.segmentation.model_dump()}
     if by_motion:
-        if config.segmentation.paths != "nodes" and _has_volume(job, source):
+        if config.segmentation.paths not in ("nodes", "ellipsoids") and _has_volume(job, source):
             settings["tracks"] = tracks(job)
         settings |= {
             name: getattr(config, name).model_dump()

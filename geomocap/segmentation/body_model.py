@@ -40,7 +40,7 @@ class Evidence:
     near : (N, N) csr_matrix
         1 where samples are near along the surface: a sample may follow the bodies of those.
     penalty : float, metres
-        Blends of two bodies count as a residual of this, at equal parts.
+        Blends of two bodies count as a residual of this, at equal parts; infinite: there are no blends.
     cap : float, metres
         Larger residuals count as this.
     noise : float, metres
@@ -75,7 +75,7 @@ class Evidence:
             model.rotations,
             model.translations,
             allowed,
-            adjacent,
+            adjacent & np.isfinite(self.penalty),
             penalty,
             self.cap,
         )

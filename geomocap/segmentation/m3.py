@@ -71,7 +71,7 @@ def segment_m3(
         raise GeometryError(f"point spacing {spacing}: expected a positive length in metres")
 
     def run(some: Points, some_progress: Progress = silent) -> Paths:
-        return match_frames(_splits(some, frames, spacing, settings, executor, some_progress), settings)
+        return ellipsoid_paths(some, frames, spacing, settings, executor, some_progress)
 
     # Steps 1 and 2: ellipsoids of every frame, matched from frame to frame
     paths = run(points, progress)
@@ -86,6 +86,21 @@ def segment_m3(
         first = paths.ellipsoids
         grouping = group_paths(integrals, first.centers[0], first.counts[0], threshold)
     return _result(paths, grouping, spacing)
+
+
+def ellipsoid_paths(
+    points: Points,
+    frames: int,
+    spacing: float,
+    settings: SegmentationSettings,
+    executor: Executor | None = None,
+    progress: Progress = silent,
+) -> Paths:
+    """Split every frame into ellipsoids, merge those of the first, and match them in time (sections 5 and 6).
+
+    Parameters and errors as of `segment_m3`.
+    """
+    return match_frames(_splits(points, frames, spacing, settings, executor, progress), settings)
 
 
 def _split(points: Points, spacing: float, settings: SegmentationSettings, frame: int) -> SplitFrame:

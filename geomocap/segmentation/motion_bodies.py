@@ -61,6 +61,7 @@ class MotionBodiesSettings(Settings):
     reach: float = Field(
         default=0.08, gt=0, lt=1, description="a sample may belong to bodies this near along the surface (extents)"
     )
+    blends: bool = Field(default=True, description="samples may follow a blend of two bodies, as soft skin does")
     blend_penalty: float = Field(
         default=0.004, ge=0, description="an even blend of two bodies counts as a residual of this (extents)"
     )
@@ -233,7 +234,7 @@ def _evidence(
         turns,
         graph.adjacency,
         near,
-        settings.blend_penalty * extent,
+        settings.blend_penalty * extent if settings.blends else np.inf,
         settings.largest_residual * extent,
         2e-4 * extent,
         settings.smoothness,

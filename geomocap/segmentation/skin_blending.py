@@ -29,6 +29,90 @@ class Blends:
     share: np.ndarray
 
 
+@numba.njit(cache=True, nogil=True)
+def _explain_one(
+    i,
+    positions,
+    weights,
+    rest,
+    certain,
+    rotations,
+    translations,
+    allowed,
+    adjacent,
+    penalty,
+    cap,
+    costs,
+    partner,
+    share,
+):
+    """Fill row i of the results of `_explain`."""
+    frames = weights.shape[1]
+    bodies = len(rotations)
+    total = 1e-12
+    for t in range(frames):
+        total += weights[i, t]
+    place = np.empty(3)
+    miss = np.empty((bodies, frames, 3))  # observed minus carried by the body
+    for b in range(bodies):
+        if not allowed[i, b]:
+            continue
+        if certain[i]:
+            for c in range(3):
+                place[c] = rest[i, c]
+        else:
+            for c in range(3):
+                place[c] = 0.0
+            for t in range(frames):
+                for c in range(3):
+                    away = weights[i, t] / total * (positions[i, t, c] - translations[b, t, c])
+                    for d in range(3):
+                        place[d] += rotations[b, t, c, d] * away
+        cost = 0.0
+        for t in range(frames):
+            square = 0.0
+            for c in range(3):
+                carried = translations[b, t, c]
+                for d in range(3):
+                    carried += rotations[b, t, c, d] * place[d]
+                miss[b, t, c] = positions[i, t, c] - carried
+                square += miss[b, t, c] ** 2
+            cost += weights[i, t] * min(square, cap)
+        costs[i, b] = cost / total
+    for a in range(bodies):
+        if not allowed[i, a]:
+            continue
+        for b in range(a):
+            if not allowed[i, b] or not adjacent[a, b]:
+                continue
+            # observed = w carried_a + (1 - w) carried_b: linear in w
+            above, below = 0.0, 1e-18
+            for t in range(frames):
+                for c in range(3):
+                    difference = miss[b, t, c] - miss[a, t, c]
+                    above += weights[i, t] * miss[b, t, c] * difference
+                    below += weights[i, t] * difference * difference
+            # of w² below - 2 w above + constant + 4 w (1 - w) penalty: the least in [0, 1]
+            curve = below / total - 4.0 * penalty
+            if curve <= 1e-18:
+                continue
+            w = (above / total - 2.0 * penalty) / curve
+            if w <= 0.0 or w >= 1.0:
+                continue
+            cost = 0.0
+            for t in range(frames):
+                square = 0.0
+                for c in range(3):
+                    square += (w * miss[a, t, c] + (1.0 - w) * miss[b, t, c]) ** 2
+                cost += weights[i, t] * min(square, cap)
+            cost = cost / total + 4.0 * w * (1.0 - w) * penalty
+            main, other, part = (a, b, w) if w >= 0.5 else (b, a, 1.0 - w)
+            if cost < costs[i, main]:
+                costs[i, main] = cost
+                partner[i, main] = other
+                share[i, main] = part
+
+
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _explain(
     positions: np.ndarray,
@@ -42,72 +126,28 @@ def _explain(
     penalty: float,
     cap: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    count, frames = weights.shape
+    count = len(weights)
     bodies = len(rotations)
     costs = np.full((count, bodies), np.inf)
     partner = np.full((count, bodies), -1, np.int32)
     share = np.ones((count, bodies))
     for i in numba.prange(count):
-        total = 1e-12
-        for t in range(frames):
-            total += weights[i, t]
-        place = np.empty(3)
-        miss = np.empty((bodies, frames, 3))  # observed minus carried by the body
-        for b in range(bodies):
-            if not allowed[i, b]:
-                continue
-            if certain[i]:
-                place[:] = rest[i]
-            else:
-                place[:] = 0.0
-                for t in range(frames):
-                    for c in range(3):
-                        away = weights[i, t] / total * (positions[i, t, c] - translations[b, t, c])
-                        for d in range(3):
-                            place[d] += rotations[b, t, c, d] * away
-            cost = 0.0
-            for t in range(frames):
-                square = 0.0
-                for c in range(3):
-                    carried = translations[b, t, c]
-                    for d in range(3):
-                        carried += rotations[b, t, c, d] * place[d]
-                    miss[b, t, c] = positions[i, t, c] - carried
-                    square += miss[b, t, c] ** 2
-                cost += weights[i, t] * min(square, cap)
-            costs[i, b] = cost / total
-        for a in range(bodies):
-            if not allowed[i, a]:
-                continue
-            for b in range(a):
-                if not allowed[i, b] or not adjacent[a, b]:
-                    continue
-                # observed = w carried_a + (1 - w) carried_b: linear in w
-                above, below = 0.0, 1e-18
-                for t in range(frames):
-                    for c in range(3):
-                        difference = miss[b, t, c] - miss[a, t, c]
-                        above += weights[i, t] * miss[b, t, c] * difference
-                        below += weights[i, t] * difference * difference
-                # of w² below - 2 w above + constant + 4 w (1 - w) penalty: the least in [0, 1]
-                curve = below / total - 4.0 * penalty
-                if curve <= 1e-18:
-                    continue
-                w = (above / total - 2.0 * penalty) / curve
-                if w <= 0.0 or w >= 1.0:
-                    continue
-                cost = 0.0
-                for t in range(frames):
-                    square = 0.0
-                    for c in range(3):
-                        square += (w * miss[a, t, c] + (1.0 - w) * miss[b, t, c]) ** 2
-                    cost += weights[i, t] * min(square, cap)
-                cost = cost / total + 4.0 * w * (1.0 - w) * penalty
-                main, other, part = (a, b, w) if w >= 0.5 else (b, a, 1.0 - w)
-                if cost < costs[i, main]:
-                    costs[i, main] = cost
-                    partner[i, main] = other
-                    share[i, main] = part
+        _explain_one(
+            np.int64(i),
+            positions,
+            weights,
+            rest,
+            certain,
+            rotations,
+            translations,
+            allowed,
+            adjacent,
+            penalty,
+            cap,
+            costs,
+            partner,
+            share,
+        )
     return costs, partner, share
 
 

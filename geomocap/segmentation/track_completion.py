@@ -101,8 +101,9 @@ def _carry_on(
                         b[c] += w * filled[j, now, c]
                 if number < 3 and (turn == 0 or number == 0):
                     continue
-                a /= total
-                b /= total
+                for c in range(3):
+                    a[c] /= total
+                    b[c] /= total
                 moment = np.zeros((3, 3))
                 for q in range(companions.shape[1]):
                     j = companions[i, q]
@@ -117,7 +118,8 @@ def _carry_on(
                     moment[c, c] += 0.02 * abs(trace) + 1e-12
                 u, _, vt = np.linalg.svd(moment)
                 if np.linalg.det(u) * np.linalg.det(vt) < 0.0:
-                    u[:, 2] *= -1.0
+                    for c in range(3):
+                        u[c, 2] *= -1.0
                 rotation = u @ vt
                 for c in range(3):
                     value = b[c]
@@ -126,7 +128,11 @@ def _carry_on(
                     filled[i, now, c] = value
                 sure[i, now] = sure[i, before] * fade
                 done[i, now] = True
-    return filled, np.where(done, sure, 0.0)
+    for i in range(count):
+        for t in range(frames):
+            if not done[i, t]:
+                sure[i, t] = 0.0
+    return filled, sure
 
 
 def complete_tracks(paths: MotionPaths) -> tuple[np.ndarray, np.ndarray]:

@@ -82,6 +82,8 @@ def test_soft_skin_is_no_body_of_its_own():
     assert same_partition(bodies.label[rigid], (weight[rigid] > 0.5).astype(int)) == 1.0
     of_second = bodies.weights[:, bodies.label[np.argmax(rest[:, 0])]]
     assert np.abs(of_second - weight)[~rigid].mean() < 0.12  # even blends are penalised
+    alone = find_motion_bodies(paths, MotionBodiesSettings(blends=False))
+    assert np.isin(alone.weights, [0.0, 1.0]).all()
 
 
 @pytest.mark.parametrize("seed", [0, 1])

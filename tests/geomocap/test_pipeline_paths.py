@@ -85,6 +85,13 @@ def test_few_patches_where_they_are_asked_for(job):
     assert motion_paths(job("patches", trajectories(100, 1.0)), Ball())[1] == "patches"
 
 
+def test_ellipsoids_of_the_paper(job):
+    paths, source = motion_paths(job("ellipsoids", trajectories(500, 1.0)), Ball())
+    assert source == "ellipsoids"
+    middles = [Ball().points(k).mean(axis=0) for k in range(FRAMES)]
+    np.testing.assert_allclose(paths.positions, [middles], atol=1e-6)  # the ball is one
+
+
 def test_patches_that_are_not_there(job):
     with pytest.raises(GeometryError, match=r"segmentation\.paths = nodes"):
         motion_paths(job("patches"), Ball())
