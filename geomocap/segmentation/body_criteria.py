@@ -25,6 +25,7 @@ _SOFT_EXCESS = np.deg2rad(12.0)  # what blends miss by more than this is no soft
 _LEAF_EXCESS = np.deg2rad(6.0)
 _SOFT_FLOOR = np.deg2rad(1.0)
 _QUANTILE = 0.95
+_HUB = 4  # so many neighbours: a trunk, whose turn may well be a small part of a limb's
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,9 @@ def judge_softness(body: int, model: BodyModel, evidence: Evidence, criterion: C
     Skin between two bodies follows both. Where it is deep, as on a thigh, no two of its samples follow them in the same
     way, and parts of it look like bodies that turn by ten or twenty degrees each. But such a part turns by a fixed
     share of the turn of the bodies beside it, whatever they do; a body of its own does not. A trunk between two limbs
-    is no skin, even if it turns by half of what they turn: other bodies hang on it that do not touch these limbs.
+    is no skin, even if it turns by half of what they turn: other bodies hang on it that do not touch these limbs. And
+    a body that touches four others or more is held to how near its share is to a half: in step with the arms, a chest
+    turns by a small part of what they turn.
     """
     found = judge(body, model, evidence, criterion)
     if not np.isfinite(found.strength):
@@ -187,7 +190,8 @@ def _between_two(
                 model.rotations[a, known], model.rotations[body, known], model.rotations[b, known]
             )
             if 0.0 < share < 1.0:
-                softness = min(softness, miss / (_SOFT_FLOOR + criterion.soft_share * turn))
+                part = 4.0 * share * (1.0 - share) if len(neighbours) >= _HUB else 1.0
+                softness = min(softness, miss / (_SOFT_FLOOR + criterion.soft_share * part * turn))
             else:
                 at_end = True
     return softness, at_end
