@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 
 FRAMES_LOOKED_AT = 20
 _FAR = np.float32(1e9)
+_BRIDGE = 3.0  # times the usual distance of neighbours
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,46 @@ def lasting_distances(positions: np.ndarray) -> np.ndarray:
     return _lasting_distances(np.ascontiguousarray(positions[:, looked_at], np.float64), rank)
 
 
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _bridges(apart: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    count = len(apart)
+    result = np.zeros((count, count), np.bool_)
+    for i in numba.prange(count):
+        for j in range(count):
+            distance = apart[i, j]
+            if j == i or distance > min(limit[i], limit[j]):
+                continue
+            between = False
+            for k in range(count):
+                if max(apart[i, k], apart[k, j]) < distance:
+                    between = True
+                    break
+            result[i, j] = not between
+    return result
+
+
+def bridges(apart: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """Pairs of samples with no third one nearer to both: neighbours across gaps (relative neighbourhood graph).
+
+    Where samples are dense on both sides of a strip without any, none across the strip is among the nearest of one.
+
+    Parameters
+    ----------
+    apart : (N, N) float32, metres
+        Symmetric.
+    limit : (N,) float, metres
+        Farthest that a sample reaches; a pair needs both.
+
+    Returns
+    -------
+    (N, N) bool
+        Symmetric.
+    """
+    return _bridges(apart, limit.astype(np.float32))
+
+
 def surface_graph(positions: np.ndarray, reference: np.ndarray, neighbours: int, max_stretch: float) -> SurfaceGraph:
-    """Connect each sample with those nearest to it in lasting distance.
+    """Connect each sample with those nearest to it in lasting distance, and across gaps with no sample in between.
 
     Parameters
     ----------
@@ -120,7 +159,9 @@ def surface_graph(positions: np.ndarray, reference: np.ndarray, neighbours: int,
     # the three nearest stay connected in any case
     rank = np.argsort(np.argsort(np.take_along_axis(apart, order, axis=1), axis=1), axis=1).ravel()
     keep = (apart[rows, columns] <= limit) | (rank < 3)
-    rows, columns = rows[keep], columns[keep]
+    linked = bridges(apart, _BRIDGE * usual)
+    linked[rows[keep], columns[keep]] = True
+    rows, columns = np.nonzero(linked)
     lengths = np.linalg.norm(reference[rows] - reference[columns], axis=1) + 1e-9
     one_way = csr_matrix((lengths, (rows, columns)), shape=(count, count))
     return SurfaceGraph(one_way.maximum(one_way.T).tocsr(), lasting, float(np.median(near[:, 0])))

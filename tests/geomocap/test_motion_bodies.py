@@ -13,7 +13,7 @@ from geomocap.segmentation.motion_labels import label_points
 from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.segmentation.rigid_motions import fit_rigid_motion, turn_angles
 from geomocap.segmentation.skin_blending import explain
-from geomocap.segmentation.surface_graph import lasting_distances, surface_graph
+from geomocap.segmentation.surface_graph import bridges, lasting_distances, surface_graph
 from geomocap.segmentation.track_completion import complete_tracks
 from geomocap.skeleton.articulated_motion import fit_articulated, prior_moments
 from geomocap.skeleton.borders import Border
@@ -392,3 +392,26 @@ def test_completion_carries_gaps_with_the_neighbours(three):
     assert np.median(miss[::5, 6:18]) < 0.01
     assert (certainty[::5, 6:18] < 1).all() and (certainty[::5, 6:18] > 0).all()
     np.testing.assert_array_equal(filled[1::5], three.positions[1::5])
+
+
+def test_bridges_are_the_relative_neighbours():
+    rng = np.random.default_rng(4)
+    points = rng.normal(size=(40, 3))
+    apart = np.linalg.norm(points[:, None] - points, axis=2).astype(np.float32)
+    np.fill_diagonal(apart, 9.0)
+    limit = np.full(40, 1.2)
+    expected = np.zeros((40, 40), bool)
+    for i, j in np.argwhere(apart <= 1.2):
+        expected[i, j] = not (np.maximum(apart[i], apart[j]) < apart[i, j]).any()
+    assert 30 < expected.sum() < 200
+    np.testing.assert_array_equal(bridges(apart, limit), expected)
+
+
+def test_a_gap_in_the_surface_is_bridged():
+    rng = np.random.default_rng(5)
+    dense = rng.uniform([0.0, 0.0, 0.0], [1.0, 1.0, 0.01], (600, 3))
+    dense = dense[np.abs(dense[:, 0] - 0.5) > 0.05]
+    positions = np.repeat(dense[:, None], 4, axis=1)
+    graph = surface_graph(positions, positions[:, 0], 8, 2.0)
+    left = dense[:, 0] < 0.5
+    assert np.isfinite(graph.geodesics(10.0)[np.ix_(left, ~left)]).all()
