@@ -110,8 +110,7 @@ def search(state: Followed, previous: FrameViews, view: FrameViews, settings: Tr
     unsure = wanted[fit[wanted] < _SURE_START]
     if len(unsure):
         some = patches.positions[unsure]
-        slack = hiding_depth(patches, view, settings.slack_px)
-        seen = (visible(patches, patches.positions, patches.frames, previous, slack, _FACING) & patches.has)[unsure]
+        seen = _asked(patches, unsure, patches.positions, patches.frames, previous, settings)[unsure]
         lifted = onward[0].copy()
         lifted[unsure] = some + lift_flow(previous, some, image_flow(previous, view, some, seen))
         start, _ = _best_start(patches, unsure, [start, (lifted, onward[1])], view, settings)
@@ -219,11 +218,10 @@ def _best_start(
     settings: TrackingSettings,
 ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Compare starts on the coarse level; return the best for each patch, and its correlation."""
-    slack = hiding_depth(patches, view, settings.slack_px)
     best = np.full(len(patches), -3.0)
     X, Q = starts[0][0].copy(), starts[0][1].copy()
     for positions, frames in starts:
-        use = visible(patches, positions, frames, view, slack, _FACING) & patches.has
+        use = _asked(patches, which, positions, frames, view, settings)
         tried = align(patches, which, positions, frames, use, view, iterations=(0, -1), least_correlation=-1.0)
         better = tried.correlation > best + 1e-3
         best[better] = tried.correlation[better]
@@ -240,8 +238,7 @@ def _align(
 ) -> Alignment:
     """Align patches with the cameras that see them where they start."""
     patches = state.patches
-    slack = hiding_depth(patches, view, settings.slack_px)
-    use = visible(patches, *start, view, slack, _FACING) & patches.has
+    use = _asked(patches, which, *start, view, settings)
     alone = (use.sum(axis=1) == 1) & state.by_one
     found = align(
         patches,
@@ -257,6 +254,22 @@ def _align(
         return found
     other = align_alone(patches, lonely, start, use, view, _ITERATIONS, settings.camera_correlation)
     return found.replaced(alone, other)
+
+
+def _asked(
+    patches: Patches,
+    which: np.ndarray,
+    positions: np.ndarray,
+    frames: np.ndarray,
+    view: FrameViews,
+    settings: TrackingSettings,
+) -> np.ndarray:
+    """Cameras with a template that see patches `which` at given places, (N, C) bool."""
+    some = patches.select(which)
+    slack = hiding_depth(some, view, settings.slack_px)
+    use = np.zeros(patches.has.shape, bool)
+    use[which] = visible(some, positions[which], frames[which], view, slack, _FACING) & some.has
+    return use
 
 
 def hiding_depth(patches: Patches, view: FrameViews, slack_px: float) -> np.ndarray:
