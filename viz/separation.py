@@ -90,13 +90,14 @@ def joints_table(results: Results) -> Block | None:
     found, skeleton = results.diagnostics, results.skeleton
     if skeleton is None or "joint_is_hinge" not in found or len(found["joint_is_hinge"]) != len(skeleton.joint_names):
         return None
+    deviations = found.get("joint_std")  # joints of a known subject's model have none
     rows, colors = [], []
     for j, name in enumerate(skeleton.joint_names):
         hinge = bool(found["joint_is_hinge"][j])
         axis = ", ".join(f"{v:.2f}" for v in found["joint_axes"][j]) if hinge else ""
-        deviation = 1000 * float(np.linalg.norm(found["joint_std"][j]))
+        deviation = "" if deviations is None else f"{1000 * float(np.linalg.norm(deviations[j])):.1f}"
         parent, child = skeleton.joint_bodies[j]
-        rows.append((name, f"{parent} – {child}", "hinge" if hinge else "ball", axis, f"{deviation:.1f}"))
+        rows.append((name, f"{parent} – {child}", "hinge" if hinge else "ball", axis, deviation))
         colors.append(hex_color(body_color(int(child))))
     head = ("joint", "bodies", "kind", "axis in frame 0", "standard deviation (mm)")
     return table(head, rows, (4,), colors)

@@ -41,7 +41,7 @@ class RefinementSettings(Settings):
         default=0.3, gt=0, le=1, description="share of the sightings that err independently of each other (0..1)"
     )
     noise: float = Field(
-        default=5e-4, gt=0, description="least standard deviation of how a sample follows its bodies (extents)"
+        default=2e-4, gt=0, description="least standard deviation of how a sample follows its bodies (extents)"
     )
     joint_sigma: float = Field(
         default=8e-4, gt=0, description="standard deviation of the joints found before, against all sightings (extents)"

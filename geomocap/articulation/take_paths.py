@@ -9,7 +9,7 @@ from geomocap.articulation.kinematics import BodyMotion, JointMotion, Linkage, j
 from geomocap.articulation.model import SubjectModel
 from geomocap.articulation.observations import SkinPoints
 from geomocap.segmentation.motion_paths import MotionPaths
-from geomocap.segmentation.rigid_motions import fit_rigid_motion
+from geomocap.segmentation.rigid_motions import fit_rigid_motion, turn_angles
 from geomocap.segmentation.rotations import nearest_rotation
 from geomocap.segmentation.track_completion import complete_tracks
 
@@ -18,6 +18,8 @@ _FILLED = 0.1  # weight of positions filled in by neighbours
 _SETTLE_ROUNDS = 3
 _LEAST_MEMBERS = 6
 _LEAST_SEEN = 3
+_AGREEING = 0.35  # radians
+_MEAN_ROUNDS = 5
 
 
 def attach_paths(model: SubjectModel, bodies: BodyMotion, paths: MotionPaths, reach: float) -> SkinPoints:
@@ -81,8 +83,8 @@ def turned_by_paths(
     """Motion whose bodies turn from frame to frame as the paths on them do.
 
     A surface says where a body is, but little of how it rolls about itself; paths say how it turns, but not from where.
-    So each body's turns come from its paths, and the constant turn before them is that which agrees best with the
-    motion given. In frames where a body shows no paths the motion given stays.
+    So each body's turns come from its paths, and the constant turn before them is that on which most frames of the
+    motion given agree. In frames where a body shows no paths the motion given stays.
 
     Parameters
     ----------
@@ -110,6 +112,20 @@ def turned_by_paths(
         shown = paths.seen[mine].sum(axis=0)
         told = shown >= _LEAST_SEEN
         if told.any():
-            start = np.einsum("t,tji,tjk->ik", shown * told, turned, bodies.rotations[:, b])
-            rotations[told, b] = turned[told] @ nearest_rotation(start)
+            starts = np.swapaxes(turned[told], 1, 2) @ bodies.rotations[told, b]
+            rotations[told, b] = turned[told] @ _agreed_rotation(starts, shown[told].astype(float))
     return joint_motion(linkage, rotations, motion.root)
+
+
+def _agreed_rotation(rotations: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Rotation that most of some (n, 3, 3) are near: the one with most others around it, then their robust mean."""
+    apart = turn_angles(np.swapaxes(rotations, 1, 2)[:, None] @ rotations[None])
+    best = rotations[int(np.argmax(_nearness(apart) @ weights))]
+    for _ in range(_MEAN_ROUNDS):
+        near = weights * _nearness(turn_angles(best.T @ rotations))
+        best = nearest_rotation(np.einsum("n,nij->ij", near, rotations))
+    return best
+
+
+def _nearness(angles: np.ndarray) -> np.ndarray:
+    return 1.0 / (1.0 + (angles / _AGREEING) ** 2) ** 2

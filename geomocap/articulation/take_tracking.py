@@ -31,6 +31,7 @@ from geomocap.settings import Settings
 _STAGE = "model"
 _REACH = 3.0  # standard deviations of the surface
 _NOISE = 2e-4  # extents
+_PATH_ROUNDS = 2  # the second with what the first has put right
 
 
 class TakeSettings(Settings):
@@ -182,9 +183,10 @@ def _fit_all(
     count = len(surface.skin)
     reach = _REACH * scales.sigma
     if paths is not None:
-        bodies = body_motion(linkage, motion)
-        skin = attach_paths(model, bodies, paths, reach)
-        motion = turned_by_paths(linkage, motion, bodies, skin, paths, _NOISE * model.extent)
+        for _ in range(_PATH_ROUNDS):
+            bodies = body_motion(linkage, motion)
+            skin = attach_paths(model, bodies, paths, reach)
+            motion = turned_by_paths(linkage, motion, bodies, skin, paths, _NOISE * model.extent)
     for _ in range(settings.rounds):
         bodies = body_motion(linkage, motion)
         points = surface.skin

@@ -73,7 +73,7 @@ def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) ->
         fit_distance=take.distance,
         first_frame=take.first_frame,
         joint_is_hinge=model.joint_hinge,
-        joint_axes=model.joint_axes,
+        joint_axes=posed(model.linkage, take.bodies, 0).axes,
     )
     write_warnings(job.run, _fit_warnings(model, take, job.config.take.poor_fit))
     return frames
