@@ -43,4 +43,15 @@ class NodeTrackingSettings(Settings):
     noise: float = Field(
         0.05, gt=0, description="least standard deviation of a node across the surface (node spacings)"
     )
+    part_rounds: int = Field(
+        2,
+        ge=0,
+        le=2,
+        description="scans: rounds in which rigid parts are registered as a whole; 0: the surface stays a skin, as "
+        "that of a capture's volume always does",
+    )
+    part_misfit: float = Field(
+        0.1, gt=0, description="points may miss two pieces of a part by this much more than each alone (node spacings)"
+    )
+    part_share: float = Field(0.01, gt=0, lt=0.5, description="smallest rigid part (share of the nodes)")
     seed: int = Field(0, ge=0, description="seed of the thinning of points")

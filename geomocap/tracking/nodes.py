@@ -21,6 +21,7 @@ from geomocap.tracking.extremities import extremities
 from geomocap.tracking.keyframes import most_open, openness
 from geomocap.tracking.node_graph import farthest_points, largest_parts, node_graph
 from geomocap.tracking.node_settings import NodeTrackingSettings
+from geomocap.tracking.rigid_parts import find_rigid_parts
 from geomocap.tracking.surface_points import PointSet, point_set, surface_graph
 from geomocap.tracking.uncertainty import node_covariance, patch_mean
 
@@ -100,8 +101,8 @@ class NodeModel:
 
     def refine(
         self, target: Target, coarse: State, homes: np.ndarray, anchors: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Fit the fine graph to a frame from the coarse graph's state; positions, rotations, covariances.
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Fit the fine graph to a frame from the coarse state; positions, rotations, covariances, which are lost.
 
         `homes` and `anchors` (P, 3) are where points are in the reference frame and in this one, NaN where not known.
         """
@@ -132,7 +133,7 @@ class NodeModel:
         covariance, support = node_covariance(
             self.patches, normals, found.support, found.across, s.slide * h, s.noise * h, anchored
         )
-        return np.where((support >= s.lost_below)[:, None], x, np.nan), R, covariance
+        return x, R, covariance, support < s.lost_below
 
 
 def _nearest_rotations(M: np.ndarray) -> np.ndarray:
@@ -217,10 +218,15 @@ def track_nodes(
     for way in (-1, 1):
         states = mend(model.coarse, marked, states, reference, way)
 
-    def refine(frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def refine(frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         target = Target(frames[frame], scales, settings.normal_weight)
         return model.refine(target, states[frame], homes[frame], known[:, frame])
 
     fine = list(map_items(refine, list(range(n_frames)), executor, "nodes", progress))
-    x, R, covariance = (np.stack([f[k] for f in fine], axis=1) for k in range(3))
+    x, R, covariance, lost = (np.stack([f[k] for f in fine], axis=1) for k in range(4))
+    if settings.part_rounds and not len(known):
+        targets = [Target(frame, scales, settings.normal_weight) for frame in frames]
+        parts, covariance = find_rigid_parts(model.graph, targets, x, R, 1.5 * model.spacing, settings, executor)
+        x, R = parts.carry(model.graph.nodes)
+    x[lost] = np.nan
     return NodeTracks(x, R, covariance, reference, model.graph.nodes, model.graph.edges)
