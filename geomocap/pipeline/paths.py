@@ -45,10 +45,10 @@ def motion_paths(job: Job, geometry: Geometry) -> tuple[MotionPaths, str]:
         )
     features = geometry.features if job.config.nodes.colors else None
     anchors = None if tracked is None else _anchors(tracked)
-    settings = job.config.nodes
+    following = job.config.nodes
     if job.capture is not None:  # the hull changes its shape with the pose: what is rigid doesn't look so
-        settings = settings.model_copy(update={"part_rounds": 0})
-    nodes = track_nodes(geometry.points, len(geometry), settings, features, job.progress, job.executor, anchors)
+        following = following.model_copy(update={"part_rounds": 0})
+    nodes = track_nodes(geometry.points, len(geometry), following, features, job.progress, job.executor, anchors)
     return nodes.motion_paths(), "nodes" if anchors is None else "both"
 
 
