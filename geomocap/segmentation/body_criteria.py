@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from geomocap.segmentation.body_model import BodyModel, Evidence
@@ -143,6 +145,9 @@ def judge_softness(body: int, model: BodyModel, evidence: Evidence, criterion: C
     is no skin, even if it turns by half of what they turn: other bodies hang on it that do not touch these limbs. And
     a body that touches four others or more is held to how near its share is to a half: in step with the arms, a chest
     turns by a small part of what they turn.
+
+    A body of too few samples goes, unless others hang together by it alone, as foot and trunk do by a leg that few
+    samples are on; it must be stronger by as much as it is too small.
     """
     found = judge(body, model, evidence, criterion)
     if not np.isfinite(found.strength):
@@ -151,9 +156,12 @@ def judge_softness(body: int, model: BodyModel, evidence: Evidence, criterion: C
     neighbours = np.flatnonzero(contacts[body] >= _LEAST_CONTACTS)
     share = float((model.label == body).mean())
     if share < criterion.min_share:
-        turns = [_turn(body, int(q), model, evidence) for q in neighbours]
-        into = int(neighbours[np.argmin(turns)])
-        return Candidate(body, 0.5 * share / criterion.min_share, into, found.turn, found.excess)
+        size = share / criterion.min_share
+        if not _connects(body, neighbours, contacts):
+            turns = [_turn(body, int(q), model, evidence) for q in neighbours]
+            into = int(neighbours[np.argmin(turns)])
+            return Candidate(body, 0.5 * size, into, found.turn, found.excess)
+        found = replace(found, strength=size * found.strength)
     softness, at_end = _between_two(body, neighbours, contacts, model, evidence, criterion)
     if np.isfinite(softness):
         strength = max(softness, found.excess / _SOFT_EXCESS)
@@ -162,6 +170,14 @@ def judge_softness(body: int, model: BodyModel, evidence: Evidence, criterion: C
     else:
         return found
     return Candidate(body, strength, -1, found.turn, found.excess) if strength < found.strength else found
+
+
+def _connects(body: int, neighbours: np.ndarray, contacts: np.ndarray) -> bool:
+    """Whether the bodies beside it hang together by this one only."""
+    touching = contacts >= _LEAST_CONTACTS
+    touching[body] = touching[:, body] = False
+    part = connected_components(csr_matrix(touching), directed=False)[1]
+    return len(np.unique(part[neighbours])) > 1
 
 
 def _between_two(

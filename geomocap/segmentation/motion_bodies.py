@@ -47,7 +47,12 @@ class MotionBodiesSettings(Settings):
     first_cut_deg: float = Field(
         default=9.0, gt=0, lt=180, description="groups of samples that turn less differently are the start (degrees)"
     )
-    min_share: float = Field(default=0.01, ge=0, lt=0.5, description="smallest body (share of the samples)")
+    min_share: float = Field(
+        default=0.01,
+        ge=0,
+        lt=0.5,
+        description="smallest body (share of the samples), unless two others hang together by it alone",
+    )
     soft_share: float = Field(
         default=0.18,
         ge=0,

@@ -415,3 +415,10 @@ def test_a_gap_in_the_surface_is_bridged():
     graph = surface_graph(positions, positions[:, 0], 8, 2.0)
     left = dense[:, 0] < 0.5
     assert np.isfinite(graph.geodesics(10.0)[np.ix_(left, ~left)]).all()
+
+
+@pytest.mark.parametrize(("halved", "bodies"), [(1, 3), (2, 2)])
+def test_a_small_body_is_one_if_others_hang_together_by_it(three, halved, bodies):
+    kept = (three.body != halved) | (np.arange(len(three.body)) % 2 == 0)
+    settings = MotionBodiesSettings(min_share=0.22)  # of the samples 2/5, 2/5 and 1/5
+    assert find_motion_bodies(MotionPaths(three.positions[kept]), settings).body_count == bodies
