@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 from scipy.sparse import csr_matrix, identity
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from geomocap.scheduling import map_items
@@ -27,10 +28,14 @@ _FORM_SCALE = 0.6  # node spacings
 _MISFIT_SCALE = 0.3
 _ALONG = 0.01  # weight of a distance along the surface relative to one across it
 _UNSEEN = 0.05  # least weight of a sample that no point supports
+_RESTING_FRAMES = 0.95  # a node may rest if points suit it in so many of the frames,
+_RESTING_SUPPORT = 0.7  # and support it so well, relative to how it was followed
+_RESTING_SHARE = 0.05  # least share of the nodes that rest side by side
 _TOGETHER = 0.025  # what it costs a node to be of another part than all its neighbours, as a share of being off
 _RINGS = 2  # a node may belong to the parts of nodes so many edges away
 _FIRST = (0.8, 0.6, 0.5, 0.4)  # node spacings
 _AGAIN = (0.5, 0.4, 0.3)
+_FORMS = ("R", "t", "form", "slope", "cost", "weight")
 
 
 @dataclass(frozen=True)
@@ -43,16 +48,24 @@ class RigidParts:
         Part of each node.
     R, t : (B, T, 3, 3), (B, T, 3) float, metres
         position = R @ reference + t.
+    rests : (B,) bool
+        Parts that stay where they are in all frames, as a robot's base does.
     """
 
     label: np.ndarray
     R: np.ndarray
     t: np.ndarray
+    rests: np.ndarray
 
     def carry(self, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions (N, T, 3) and rotations (N, T, 3, 3) of nodes (N, 3)."""
         R = self.R[self.label]
         return (R @ nodes[:, None, :, None])[..., 0] + self.t[self.label], R
+
+    def at_rest(self, rests: np.ndarray) -> RigidParts:
+        """Let parts rest, (B,) bool."""
+        turns = np.where(rests[:, None, None, None], np.eye(3), self.R)
+        return RigidParts(self.label, turns, np.where(rests[:, None, None], 0.0, self.t), rests)
 
 
 class PartTracker:
@@ -71,20 +84,38 @@ class PartTracker:
     def find(self, x: np.ndarray, R: np.ndarray, each: Callable[..., list]) -> RigidParts:
         """Find the parts of nodes at x (N, T, 3) with rotations R (N, T, 3, 3), and their motions.
 
+        What may rest does: of a shaft that stands still below another, nothing is seen of whether it turns with it.
         `each(function, frames)` calls a function for each frame.
         """
         g, s = self.graph, self.settings
         frames = list(range(x.shape[1]))
         least = max(4, round(s.part_share * len(g.nodes)))
         forms = _stack(each(lambda k: self.forms(k, x[:, k], R[:, k]), frames))
-        label = group_nodes(forms, g.edges, s.part_misfit * g.spacing, least)
-        parts = part_motions(label, g.nodes, x, R, 0.3 * g.spacing)
+        unmoved = np.broadcast_to(np.eye(3), R[:, 0].shape)
+        at_rest = _stack(each(lambda k: self.forms(k, g.nodes, unmoved, along=1.0), frames))
+        still = self.resting(forms, at_rest)
+        label = group_nodes(_either(still, at_rest, forms), g.edges, s.part_misfit * g.spacing, least)
+        rests = 2 * np.bincount(label, still) > np.bincount(label)
+        parts = part_motions(label, g.nodes, x, R, 0.3 * g.spacing).at_rest(rests)
         for scales in (_FIRST, _AGAIN)[: s.part_rounds]:
             parts = self._settled(parts, x, R, each, frames)
-            moved = each(lambda k, p=parts, c=scales: self.register(k, p.label, p.R[:, k], p.t[:, k], c), frames)
+            moved = each(lambda k, p=parts, c=scales: self.register(k, p, c), frames)
             parts = replace(parts, R=np.stack([m[0] for m in moved], 1), t=np.stack([m[1] for m in moved], 1))
             x, R = parts.carry(g.nodes)
         return self._settled(parts, x, R, each, frames)
+
+    def resting(self, forms: MotionForms, at_rest: MotionForms) -> np.ndarray:
+        """Nodes (N,) that points suit as well if they stay where they are, `at_rest`, as the way they were followed."""
+        N, T = forms.weight.shape
+        weight, followed = np.maximum(at_rest.weight, 1e-6), np.maximum(forms.weight, 1e-6)
+        worst = int(_RESTING_FRAMES * (T - 1))
+        more = np.sort(at_rest.cost / weight - forms.cost / followed, axis=1)[:, worst]
+        support = np.sort(at_rest.weight / followed, axis=1)[:, T - 1 - worst]
+        still = (more < (self.settings.part_misfit * self.graph.spacing) ** 2) & (support > _RESTING_SUPPORT)
+        still = 2 * (self.near @ still.astype(float)) > self.near_count.ravel()
+        beside = connected_components(self.near[still][:, still], directed=False)[1]
+        still[still] = np.bincount(beside)[beside] >= _RESTING_SHARE * N
+        return still
 
     def _settled(
         self, parts: RigidParts, x: np.ndarray, R: np.ndarray, each: Callable[..., list], frames: list[int]
@@ -107,8 +138,8 @@ class PartTracker:
         for _ in range(3):
             beside = (self.near @ np.eye(len(parts.R))[label]) / self.near_count
             label = np.where(nothing_known, label, (cost - _TOGETHER * beside).argmin(axis=1))
-        label = np.unique(label, return_inverse=True)[1]
-        return part_motions(label, self.graph.nodes, x, R, 0.3 * self.graph.spacing)
+        kept, label = np.unique(label, return_inverse=True)
+        return part_motions(label, self.graph.nodes, x, R, 0.3 * self.graph.spacing).at_rest(parts.rests[kept])
 
     def forms(self, frame: int, x: np.ndarray, R: np.ndarray, along: float = _ALONG) -> MotionForms:
         """What a frame's points know of the motion of each node; lengths in metres.
@@ -163,11 +194,11 @@ class PartTracker:
         distance = tree.query(np.hstack([y, c * n]), distance_upper_bound=3 * c)[0]
         return 1 - np.exp(-0.5 * np.minimum(distance / c, 3.0) ** 2)
 
-    def register(
-        self, frame: int, label: np.ndarray, R: np.ndarray, t: np.ndarray, scales: Sequence[float]
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def register(self, frame: int, parts: RigidParts, scales: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
         """Fit the parts' motions R (B, 3, 3), t (B, 3) to a frame; at borders both parts hold on to each other."""
         g, s, target = self.graph, self.settings, self.targets[frame]
+        label, R, t = parts.label, parts.R[:, frame], parts.t[:, frame]
+        free = np.repeat(~parts.rests, 6)
         hinges = g.edges[label[g.edges[:, 0]] != label[g.edges[:, 1]]]
         lengths = np.linalg.norm(g.nodes[hinges[:, 0]] - g.nodes[hinges[:, 1]], axis=1)
         firm = s.fine_stiffness * s.stiffness * len(g.samples) / len(g.nodes) / 4
@@ -184,7 +215,8 @@ class PartTracker:
                 R, t, middle, label, g.samples, g.binding, g.weights, found.A, found.b, g.nodes, hinges, hold
             )
             damping = 1e-3 * np.bincount(label, minlength=len(R))[:, None] * ([g.spacing**2] * 3 + [1.0] * 3)
-            step = np.linalg.solve(H + np.diag(damping.ravel()), b.ravel()).reshape(-1, 6)
+            step = np.zeros((len(R), 6))
+            step.ravel()[free] = np.linalg.solve((H + np.diag(damping.ravel()))[np.ix_(free, free)], b.ravel()[free])
             much = np.maximum(np.linalg.norm(step[:, :3], axis=1, keepdims=True) / 0.5, 1.0)
             turn = rotation_of(step[:, :3] / much)
             t = (turn @ (t - middle)[..., None])[..., 0] + middle + step[:, 3:]
@@ -286,7 +318,7 @@ def part_motions(label: np.ndarray, nodes: np.ndarray, x: np.ndarray, R: np.ndar
         U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
         turns[b] = U @ Vt
         shifts[b] = middle - turns[b] @ start
-    return RigidParts(label, turns, shifts)
+    return RigidParts(label, turns, shifts, np.zeros(B, bool))
 
 
 def find_rigid_parts(
@@ -332,8 +364,13 @@ def find_rigid_parts(
 
 
 def _stack(forms: list[MotionForms]) -> MotionForms:
-    names = ("R", "t", "form", "slope", "cost", "weight")
-    return MotionForms(*(np.stack([getattr(f, name) for f in forms], axis=1) for name in names))
+    return MotionForms(*(np.stack([getattr(f, name) for f in forms], axis=1) for name in _FORMS))
+
+
+def _either(chosen: np.ndarray, first: MotionForms, second: MotionForms) -> MotionForms:
+    """The first's forms of the nodes chosen, (N,) bool, the second's of the others."""
+    pairs = ((getattr(first, name), getattr(second, name)) for name in _FORMS)
+    return MotionForms(*(np.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
 
 
 def _means(x: np.ndarray, label: np.ndarray, count: int) -> np.ndarray:
