@@ -14,6 +14,7 @@ _NEAREST = 6
 _FRAMES = 10
 _NEAR = 1.5  # spacings of the samples
 _BESIDE = 0.75  # of the narrower body
+_SHORT = 2.0 / 3.0  # of its radius
 _OUTLIERS = 0.02
 
 
@@ -45,8 +46,8 @@ class Border:
 
         Where the bodies lie side by side along most of the narrower one, as a lid and its box or thigh and shank do,
         the joint is in the middle of what they share. Otherwise one begins where the other ends: if the smaller one is
-        short along the axis against its radius, as a wheel or an upper arm, it turns about its own middle; a shaft or a
-        turret goes on along the axis, and the joint is where it is borne, at the border.
+        short along the axis against its radius, as a wheel or an upper arm, it turns about its own middle; a shaft, a
+        turret or a head goes on along the axis, and the joint is where it is borne, at the border.
         """
         ends = [_reach(body, point, axis) for body in self.bodies]
         low, high = max(e[0] for e in ends), min(e[1] for e in ends)
@@ -54,7 +55,7 @@ class Border:
         if high - low >= _BESIDE * min(lengths):
             return point + 0.5 * (low + high) * axis
         smaller = int(len(self.bodies[1]) < len(self.bodies[0]))
-        if lengths[smaller] < _radius(self.bodies[smaller], point, axis):
+        if lengths[smaller] < _SHORT * _radius(self.bodies[smaller], point, axis):
             return point + 0.5 * sum(ends[smaller]) * axis
         return point + ((self.middle - point) @ axis) * axis
 

@@ -182,6 +182,9 @@ def test_where_on_its_axis_a_hinge_is():
     # a tower on top: where it stands
     tower = rng.random((200, 3)) * [0.2, 0.2, 1.0] + [0.4, 0.2, 0.3]
     np.testing.assert_allclose(middle(tower, [0.5, 0.3, 0.3], [0.5, 0.3, 0.9], z), [0.5, 0.3, 0.3], atol=0.07)
+    # so does a head that is nearly as wide as high
+    head = rng.random((200, 3)) * [0.3, 0.3, 0.18] + [0.35, 0.1, 0.3]
+    np.testing.assert_allclose(middle(head, [0.5, 0.25, 0.3], [0.5, 0.25, 0.9], z), [0.5, 0.25, 0.3], atol=0.05)
     # a wheel at the side: the wheel's middle
     wheel = rng.random((200, 3)) * [0.1, 0.5, 0.5] + [1.0, 0.0, -0.1]
     np.testing.assert_allclose(middle(wheel, [1.0, 0.25, 0.15], [0.3, 0.25, 0.15], x), [1.05, 0.25, 0.15], atol=0.02)
