@@ -27,6 +27,7 @@ _SOFT_EXCESS = np.deg2rad(12.0)  # what blends miss by more than this is no soft
 _LEAF_EXCESS = np.deg2rad(6.0)
 _SOFT_FLOOR = np.deg2rad(1.0)
 _QUANTILE = 0.95
+_SMALL = 1.5  # times what other bodies need
 _HUB = 4  # so many neighbours: a trunk, whose turn may well be a small part of a limb's
 
 
@@ -147,7 +148,7 @@ def judge_softness(body: int, model: BodyModel, evidence: Evidence, criterion: C
     turns by a small part of what they turn.
 
     A body of too few samples goes, unless others hang together by it alone, as foot and trunk do by a leg that few
-    samples are on; it must be stronger by as much as it is too small.
+    samples are on; it must be stronger by as much as it is too small, and half again.
     """
     found = judge(body, model, evidence, criterion)
     if not np.isfinite(found.strength):
@@ -161,7 +162,7 @@ def judge_softness(body: int, model: BodyModel, evidence: Evidence, criterion: C
             turns = [_turn(body, int(q), model, evidence) for q in neighbours]
             into = int(neighbours[np.argmin(turns)])
             return Candidate(body, 0.5 * size, into, found.turn, found.excess)
-        found = replace(found, strength=size * found.strength)
+        found = replace(found, strength=size * found.strength / _SMALL)
     softness, at_end = _between_two(body, neighbours, contacts, model, evidence, criterion)
     if np.isfinite(softness):
         strength = max(softness, found.excess / _SOFT_EXCESS)
