@@ -17,7 +17,7 @@ _HULL_SLACK = 3.0  # voxels that a seed may lie behind the drawn surface
 _REGULAR = 1e-12
 _ROUNDS = 3
 _PACKING = 0.7  # points placed at random at least r apart, as many as fit: 0.7 a square of r
-_COVER = 0.7  # half the width of a patch, as a share of the spacing
+_COVER = 1.0  # half the width of a patch, as a share of the spacing: neighbours overlap
 _PEAK_PX = 3.0  # half the width of a peak of correlation along the ray, pixels
 _CLEAR = 0.05  # correlation by which it must exceed all others
 _SWEEP_PX = 1.0  # step of the search along the viewing ray, pixels
@@ -30,7 +30,7 @@ def seed_spacing(view: FrameViews, n_patches: int) -> float:
 
 
 def image_reduction(view: FrameViews, settings: TrackingSettings) -> int:
-    """Return by how much images may be reduced: to pixels with which patches of `radius_px` just cover the surface.
+    """Return by how much images may be reduced: to pixels with which patches of `radius_px` cover the surface twice.
 
     Finer images have more noise and less texture in a patch, and take longer.
     """

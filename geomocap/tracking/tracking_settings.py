@@ -26,7 +26,7 @@ class TrackingSettings(Settings):
     Bodies come out better from the longer tracks of "updated".
     """
 
-    n_patches: int = Field(2000, ge=10, le=100_000, description="Patches placed on a frame's whole surface")
+    n_patches: int = Field(4000, ge=10, le=100_000, description="Patches placed on a frame's whole surface")
     radius_px: int = Field(5, ge=2, le=20, description="Half the width of a patch (pixels)")
     reduction: int | None = Field(
         None, ge=1, le=16, description="Reduction of the images; so that patches just cover the surface if not given"

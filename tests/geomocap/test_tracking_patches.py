@@ -84,10 +84,10 @@ def test_reduced_frames_show_the_same_scene_in_larger_pixels(scene):
     assert abs(half.masks.sum() * 4 / full.masks.sum() - 1) < 0.01
 
 
-def test_images_are_reduced_until_patches_just_cover_the_surface(views):
+def test_images_are_reduced_until_patches_cover_the_surface_twice(views):
     few = TrackingSettings(n_patches=100, radius_px=2)
     spacing, pixel = seed_spacing(views[0], 100), np.median(views[0].pixel_size(views[0].surface))
-    assert image_reduction(views[0], few) == round(0.7 * spacing / (2 * pixel)) == 4
+    assert image_reduction(views[0], few) == round(spacing / (2 * pixel)) == 6
     assert image_reduction(views[0], few.model_copy(update={"n_patches": 20_000})) == 1
 
 
