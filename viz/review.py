@@ -36,6 +36,13 @@ from viz.sections import (
 from viz.video import motion_video
 from viz.views import Stage
 
+_FOLLOWED = {
+    "patches": "patches of the images",
+    "nodes": "nodes of a deformable surface",
+    "both": "nodes of a deformable surface, held by patches of the images",
+    "ellipsoids": "ellipsoids",
+}
+
 
 @dataclass
 class Desk:
@@ -312,8 +319,7 @@ def _separation(results: Results, stage: Stage | None, desk: Desk) -> list[Block
     found = results.diagnostics
     if stage is None or "sample_body" not in found:
         return []
-    source = {"patches": "patches of the images", "nodes": "nodes of a deformable surface"}
-    followed = source.get(str(found.get("paths", "")), "motion paths")
+    followed = _FOLLOWED.get(str(found.get("paths", "")), "motion paths")
     words = (
         f"The bodies come from {len(found['sample_body'])} {followed}, followed through all frames. Where a subject "
         "bends in many small steps, like a trunk or a tail, any border is arbitrary: the other numbers of bodies are "

@@ -1,0 +1,132 @@
+import numpy as np
+import pytest
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.spatial.distance import squareform
+from scipy.spatial.transform import Rotation
+
+from geomocap.segmentation.connected_linkage import connected_linkage
+from geomocap.segmentation.local_rotations import local_rotations, turn_distances
+from geomocap.segmentation.rigid_motions import fit_rigid_motion, turn_angles
+from geomocap.segmentation.skin_blending import explain
+from geomocap.segmentation.surface_graph import bridges, lasting_distances, surface_graph
+
+
+def test_lasting_distances_are_the_third_largest():
+    positions = np.random.default_rng(0).random((7, 20, 3))
+    apart = np.linalg.norm(positions[:, None] - positions[None], axis=3)
+    np.testing.assert_allclose(lasting_distances(positions), np.sort(apart, axis=2)[:, :, -3], rtol=1e-6)
+
+
+def test_samples_that_touch_for_a_while_are_no_neighbours():
+    line = np.stack([np.linspace(0, 1, 30), np.zeros(30), np.zeros(30)], axis=1)
+    frames = 20
+    fixed = np.tile(line[:, None], (1, frames, 1))
+    other = fixed + np.array([0.0, 0.01, 0.0])
+    other[:, 8:] += np.array([0.0, 0.5, 0.0])
+    positions = np.concatenate([fixed, other])
+    linked = surface_graph(positions, positions[:, 0], 4, 2.0).neighbours
+    assert not linked[:30, 30:].any()
+    assert linked[np.arange(29), np.arange(1, 30)].all()
+
+
+def test_local_rotations_and_their_distances_are_the_reference_ones():
+    rng = np.random.default_rng(3)
+    positions, weights = rng.random((12, 5, 3)), rng.random((12, 5))
+    geodesics = np.linalg.norm(positions[:, None, 0] - positions[None, :, 0], axis=2)
+    radius = 0.6
+    fitted = local_rotations(positions, positions[:, 0], weights, geodesics, radius)
+    for i in (0, 7):
+        near = geodesics[i] <= radius
+        for t in (1, 4):
+            w = np.exp(-((geodesics[i, near] / (0.6 * radius)) ** 2)) * weights[near, t]
+            start, moved = positions[near, 0], positions[near, t]
+            expected = Rotation.align_vectors(
+                moved - np.average(moved, axis=0, weights=w), start - np.average(start, axis=0, weights=w), weights=w
+            )[0].as_matrix()
+            np.testing.assert_allclose(fitted[i, t], expected, atol=1e-5)
+    angles = turn_angles(np.einsum("atij,btik->abtjk", fitted, fitted))
+    np.testing.assert_allclose(turn_distances(fitted, share=0.3), np.sort(angles, axis=2)[:, :, -2], atol=2e-3)
+
+
+def test_linkage_of_samples_that_are_all_neighbours_is_average_linkage():
+    rng = np.random.default_rng(4)
+    points = rng.random((40, 2))
+    distances = np.linalg.norm(points[:, None] - points[None], axis=2)
+    tree = connected_linkage(distances, ~np.eye(40, dtype=bool))
+    expected = linkage(squareform(distances, checks=False), "average")
+    np.testing.assert_allclose(tree.heights, expected[:, 2])
+    cut = tree.cut(0.3)
+    reference = fcluster(expected, 0.3, "distance")
+    assert len(np.unique(np.stack([cut, reference]), axis=1).T) == len(np.unique(cut)) == len(np.unique(reference))
+    assert tree.cut_count(7).max() == 6
+
+
+def test_linkage_never_joins_what_is_not_connected():
+    linked = np.zeros((6, 6), bool)
+    for a, b in ((0, 1), (1, 2), (3, 4), (4, 5)):
+        linked[a, b] = linked[b, a] = True
+    tree = connected_linkage(np.zeros((6, 6)), linked)
+    np.testing.assert_array_equal(tree.cut(1.0), [0, 0, 0, 1, 1, 1])
+
+
+def test_rigid_motion_is_steady_against_samples_that_do_not_follow():
+    rng = np.random.default_rng(6)
+    rest = rng.random((40, 3))
+    true = Rotation.from_rotvec(rng.normal(scale=0.5, size=(6, 3))).as_matrix()
+    positions = np.einsum("tij,nj->nti", true, rest) + 1.0
+    positions[:8] += rng.normal(scale=0.3, size=(8, 6, 3))
+    rotations, translations, residuals = fit_rigid_motion(positions, rest, np.ones((40, 6)), 1e-4)
+    assert np.rad2deg(turn_angles(rotations.swapaxes(1, 2) @ true)).max() < 0.05
+    assert np.abs(translations - 1.0).max() < 1e-3
+    assert residuals[:8].min() > residuals[8:].max()
+
+
+def test_blends_are_those_of_a_search_over_weights():
+    rng = np.random.default_rng(7)
+    rotations = Rotation.from_rotvec(rng.normal(scale=0.4, size=(15, 3))).as_matrix().reshape(3, 5, 3, 3)
+    translations = rng.normal(scale=0.1, size=(3, 5, 3))
+    rest = rng.random((4, 3))
+    carried = np.einsum("btij,nj->nbti", rotations, rest) + translations[None]
+    weights = rng.random((4, 5)) + 0.2
+    mix = np.array([[0.7, 0.3, 0.0], [0.0, 0.2, 0.8], [1.0, 0.0, 0.0], [0.45, 0.0, 0.55]])
+    positions = np.einsum("nb,nbti->nti", mix, carried) + rng.normal(scale=0.003, size=(4, 5, 3))
+    penalty = 0.02
+    everything = np.ones((4, 3), bool), np.ones((3, 3), bool)
+    blends = explain(positions, weights, rest, np.ones(4, bool), rotations, translations, *everything, penalty, 10.0)
+    for i in range(4):
+        best = {}
+        for a in range(3):
+            for b in range(3):
+                if a == b:
+                    continue
+                for w in np.linspace(0.5, 1.0, 2001):
+                    miss = ((w * carried[i, a] + (1 - w) * carried[i, b] - positions[i]) ** 2).sum(axis=1)
+                    cost = np.average(miss, weights=weights[i]) + 4 * w * (1 - w) * penalty**2
+                    best[a] = min(best.get(a, (np.inf, 0.0)), (cost, w))
+        main = int(np.argmin(blends.costs[i]))
+        assert main == min(best, key=lambda a: best[a])
+        assert blends.costs[i, main] == pytest.approx(best[main][0], rel=1e-3, abs=1e-9)
+        assert blends.share[i, main] == pytest.approx(best[main][1], abs=2e-3)
+
+
+def test_bridges_are_the_relative_neighbours():
+    rng = np.random.default_rng(4)
+    points = rng.normal(size=(40, 3))
+    apart = np.linalg.norm(points[:, None] - points, axis=2).astype(np.float32)
+    np.fill_diagonal(apart, 9.0)
+    limit = np.full(40, 1.2)
+    expected = np.zeros((40, 40), bool)
+    for i, j in np.argwhere(apart <= 1.2):
+        expected[i, j] = not (np.maximum(apart[i], apart[j]) < apart[i, j]).any()
+    assert 30 < expected.sum() < 200
+    np.testing.assert_array_equal(bridges(apart, limit), expected)
+
+
+def test_a_gap_in_the_surface_is_bridged():
+    rng = np.random.default_rng(5)
+    dense = rng.uniform([0.0, 0.0, 0.0], [1.0, 1.0, 0.01], (600, 3))
+    dense = dense[np.abs(dense[:, 0] - 0.5) > 0.05]
+    positions = np.repeat(dense[:, None], 4, axis=1)
+    graph = surface_graph(positions, positions[:, 0], 8, 2.0)
+    left = dense[:, 0] < 0.5
+    assert np.isfinite(graph.geodesics(10.0)[np.ix_(left, ~left)]).all()
