@@ -266,7 +266,7 @@ def _tracks(results: Results, stage: Stage | None, frames: list[int], desk: Desk
     middle = frames[len(frames) // 2]
     words = (
         "Red is what was cut off or removed as too fast, accelerated too much, unlike the motion around it, or too "
-        "short (`--filters.*`)."
+        "short (--filters.*)."
     )
     over = tracks.filter_sheet(results, stage, found, middle)
     return blocks + desk.sheet("filters", over, f"Filters off and on, frame {middle}", words)
