@@ -65,6 +65,7 @@ def adjust(
     smoothness: Smoothness | None = None,
     pose_prior: PosePrior | None = None,
     joint_prior: JointPrior | None = None,
+    looseness: np.ndarray | None = None,
     cutoff: float = 3.0,
     rounds: int = 10,
     least_gain: float = 1e-4,
@@ -83,6 +84,8 @@ def adjust(
         What is expected of each frame.
     joint_prior : JointPrior, optional
         Joints are unknowns, too; without it they stay.
+    looseness : (J,) float, metres, optional
+        Standard deviation of the joints' slips and of their accelerations; without it joints hold.
     cutoff : float
         Residuals of this many standard deviations count half (Cauchy).
     rounds : int
@@ -91,7 +94,11 @@ def adjust(
         Stop when a step lowers the cost by a smaller share.
     """
     damping = 1e-4
-    priors = (smoothness, pose_prior, joint_prior)
+    priors = (smoothness, pose_prior, joint_prior, looseness)
+    if looseness is None:
+        motion = replace(motion, slip=None)
+    elif motion.slip is None:
+        motion = replace(motion, slip=np.zeros((motion.frames, len(linkage.joints), 3)))
     system = _system(linkage, motion, points, observations, priors, cutoff)
     for _ in range(rounds):
         improved = False
@@ -116,7 +123,10 @@ def adjust(
 
 @dataclass(frozen=True)
 class _System:
-    """Normal equations: `blocks` (T, D, D), `border` (T, D, G) and `corner` (G, G), right sides, and the prior."""
+    """Normal equations: `blocks` (T, D, D), `border` (T, D, G) and `corner` (G, G), right sides, and the prior.
+
+    Degrees of freedom before `turns` are of the root and turns of the joints; those from there on are slips.
+    """
 
     blocks: np.ndarray
     border: np.ndarray
@@ -125,6 +135,7 @@ class _System:
     corner_right: np.ndarray
     prior: np.ndarray | None
     cost: float
+    turns: int
 
     def solve(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
         """Steps of the degrees of freedom, (T, D), and of the joints, (J, 3)."""
@@ -141,8 +152,7 @@ class _System:
             shift = cho_solve(cho_factor(reduced), self.corner_right - border.T @ step)
             step = step - solved[:, 1:] @ shift
         step = step.reshape(frames, size)
-        turns = np.ones(size, bool)
-        turns[3:6] = False
+        turns = np.r_[0:3, 6 : self.turns]
         step[:, turns] = np.clip(step[:, turns], -_LONGEST_TURN, _LONGEST_TURN)
         return step, shift.reshape(-1, 3)
 
@@ -175,14 +185,15 @@ def _system(
     motion: JointMotion,
     points: SkinPoints,
     observations: Observations,
-    priors: tuple[Smoothness | None, PosePrior | None, JointPrior | None],
+    priors: tuple[Smoothness | None, PosePrior | None, JointPrior | None, np.ndarray | None],
     cutoff: float,
 ) -> _System:
-    smoothness, pose_prior, joint_prior = priors
+    smoothness, pose_prior, joint_prior, looseness = priors
     bodies = body_motion(linkage, motion)
-    size = int(linkage.joint_dof[-1])
+    turns = int(linkage.joint_dof[-1])
+    size = turns + (3 * len(linkage.joints) if looseness is not None else 0)
     shared = 3 * len(linkage.joints) if joint_prior is not None else 0
-    chain, chain_start = _unknowns_of_bodies(linkage, joint_prior is not None)
+    chain, chain_start = _unknowns_of_bodies(linkage, looseness is not None, joint_prior is not None)
     frames = motion.frames
     blocks, right = np.empty((frames, size, size)), np.empty((frames, size))
     border = np.empty((frames, size, shared))
@@ -214,7 +225,7 @@ def _system(
         cost += float(costs.sum())
     prior = None
     if smoothness is not None and frames > 2:
-        prior, value, prior_cost = prior_terms(linkage, motion, smoothness)
+        prior, value, prior_cost = prior_terms(linkage, motion, smoothness, looseness)
         push = prior * value
         right[:-2] -= push
         right[1:-1] += 2.0 * push
@@ -222,8 +233,8 @@ def _system(
         cost += prior_cost
     if pose_prior is not None:
         weights, away, pose_cost = pose_terms(linkage, motion, pose_prior)
-        blocks[:, np.arange(size), np.arange(size)] += weights
-        right -= weights * away
+        blocks[:, np.arange(turns), np.arange(turns)] += weights
+        right[:, :turns] -= weights * away
         cost += pose_cost
     if joint_prior is not None:
         weight = joint_prior.sigma**-2
@@ -231,18 +242,28 @@ def _system(
         corner[np.diag_indices(shared)] += weight
         corner_right -= weight * apart.ravel()
         cost += 0.5 * weight * float((apart**2).sum())
-    return _System(blocks, border, corner, right, corner_right, prior, cost)
+    if looseness is not None:
+        assert motion.slip is not None
+        tightness = np.repeat(looseness**-2.0, 3)
+        slip = motion.slip.reshape(frames, -1)
+        blocks[:, np.arange(turns, size), np.arange(turns, size)] += tightness
+        right[:, turns:] -= tightness * slip
+        cost += 0.5 * float((tightness * slip**2).sum())
+    return _System(blocks, border, corner, right, corner_right, prior, cost, turns)
 
 
-def _unknowns_of_bodies(linkage: Linkage, with_joints: bool) -> tuple[np.ndarray, np.ndarray]:
+def _unknowns_of_bodies(linkage: Linkage, with_slips: bool, with_joints: bool) -> tuple[np.ndarray, np.ndarray]:
     """Unknowns that move each body: degrees of freedom and, after all of these, the places of joints."""
     first = linkage.joint_dof
     lists = []
     for row in linkage.chains():
         joints = np.flatnonzero(row)
         unknowns = [np.arange(6), *(np.arange(first[j], first[j + 1]) for j in joints)]
-        if with_joints:
-            unknowns += [first[-1] + 3 * j + np.arange(3) for j in joints]
+        last = first[-1]
+        for present in (with_slips, with_joints):
+            if present:
+                unknowns += [last + 3 * j + np.arange(3) for j in joints]
+                last += 3 * len(linkage.joints)
         lists.append(np.concatenate(unknowns))
     return np.concatenate(lists), np.concatenate([[0], np.cumsum([len(u) for u in lists])])
 
@@ -250,18 +271,22 @@ def _unknowns_of_bodies(linkage: Linkage, with_joints: bool) -> tuple[np.ndarray
 def _twists(linkage: Linkage, motion: JointMotion, bodies: BodyMotion, with_joints: bool) -> np.ndarray:
     """Twists (T, K, 6) of all unknowns, see `normal_equations`."""
     first = linkage.joint_dof
-    frames, size = motion.frames, int(first[-1])
-    twists = np.zeros((frames, size + (3 * len(linkage.joints) if with_joints else 0), 6))
+    frames, count = motion.frames, 3 * len(linkage.joints)
+    slips = int(first[-1])
+    places = slips + (0 if motion.slip is None else count)
+    twists = np.zeros((frames, places + (count if with_joints else 0), 6))
     twists[:, :3, :3] = np.eye(3)
     twists[:, :3, 3:] = np.cross(motion.root[:, None], np.eye(3))
     twists[:, 3:6, 3:] = np.eye(3)
     for j, (parent, child) in enumerate(linkage.hierarchy.joint_bodies):
         turned = bodies.rotations[:, parent]
         axes = (turned @ linkage.axes[j])[:, None] if linkage.hinge[j] else turned.swapaxes(1, 2)
-        place = turned @ linkage.joints[j] + bodies.translations[:, parent]
+        place = bodies.rotations[:, child] @ linkage.joints[j] + bodies.translations[:, child]
         twists[:, first[j] : first[j + 1], :3] = axes
         twists[:, first[j] : first[j + 1], 3:] = np.cross(place[:, None], axes)
+        if motion.slip is not None:
+            twists[:, slips + 3 * j : slips + 3 * j + 3, 3:] = turned.swapaxes(1, 2)
         if with_joints:
-            at = size + 3 * j
+            at = places + 3 * j
             twists[:, at : at + 3, 3:] = (turned - bodies.rotations[:, child]).swapaxes(1, 2)
     return twists

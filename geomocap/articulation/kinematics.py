@@ -79,10 +79,13 @@ class JointMotion:
         Rotation of each body since rest in its parent's axes (parent from child); of the root, in world axes.
     root : (T, 3) float, metres, world
         Path of the linkage's origin.
+    slip : (T, J, 3) float, metres, optional
+        How far each child's end of a joint is from its parent's, in the parent's axes; none: joints hold.
     """
 
     local: np.ndarray
     root: np.ndarray
+    slip: np.ndarray | None = None
 
     @property
     def frames(self) -> int:
@@ -91,7 +94,7 @@ class JointMotion:
 
     def part(self, frames: slice) -> JointMotion:
         """Motion of some frames."""
-        return JointMotion(self.local[frames], self.root[frames])
+        return JointMotion(self.local[frames], self.root[frames], None if self.slip is None else self.slip[frames])
 
 
 @dataclass(frozen=True)
@@ -135,10 +138,12 @@ def body_motion(linkage: Linkage, motion: JointMotion) -> BodyMotion:
     translations = np.empty((*motion.local.shape[:2], 3))
     rotations[:, root] = motion.local[:, root]
     translations[:, root] = motion.root - rotations[:, root] @ linkage.origin
-    for joint, (parent, child) in zip(linkage.joints, linkage.hierarchy.joint_bodies, strict=True):
+    for j, (parent, child) in enumerate(linkage.hierarchy.joint_bodies):
         rotations[:, child] = rotations[:, parent] @ motion.local[:, child]
         turned = rotations[:, parent] - rotations[:, child]
-        translations[:, child] = translations[:, parent] + turned @ joint
+        translations[:, child] = translations[:, parent] + turned @ linkage.joints[j]
+        if motion.slip is not None:
+            translations[:, child] += np.einsum("tij,tj->ti", rotations[:, parent], motion.slip[:, j])
     return BodyMotion(rotations, translations)
 
 
@@ -177,9 +182,9 @@ def moved_by(linkage: Linkage, motion: JointMotion, step: np.ndarray) -> JointMo
     ----------
     linkage : Linkage
     motion : JointMotion
-    step : (T, D) float
+    step : (T, D) or (T, D + 3 J) float
         Root: turn about its origin (radians, world axes), shift (metres); joints: turn (radians) in the parent's axes,
-        of hinges about the axis.
+        of hinges about the axis; of joints that slip, their slips (metres) after all turns.
     """
     local = motion.local.copy()
     root = linkage.hierarchy.root
@@ -189,7 +194,8 @@ def moved_by(linkage: Linkage, motion: JointMotion, step: np.ndarray) -> JointMo
         turn = step[:, first[j] : first[j + 1]]
         vector = turn * linkage.axes[j] if linkage.hinge[j] else turn
         local[:, child] = Rotation.from_rotvec(vector).as_matrix() @ local[:, child]
-    return JointMotion(local, motion.root + step[:, 3:6])
+    slip = None if motion.slip is None else motion.slip + step[:, first[-1] :].reshape(motion.slip.shape)
+    return JointMotion(local, motion.root + step[:, 3:6], slip)
 
 
 def posed(linkage: Linkage, motion: BodyMotion, frame: int) -> Linkage:

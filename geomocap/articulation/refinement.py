@@ -24,6 +24,7 @@ from geomocap.articulation.smoothness import Smoothness, typical_accelerations
 from geomocap.segmentation.motion_bodies import MotionBodies
 from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.settings import Settings
+from geomocap.skeleton.motion import fit_offsets, forward_kinematics, local_rotations
 from geomocap.skeleton.motion_skeleton import MotionSkeleton, skeleton_of_motion
 
 _MEDIAN_LENGTH = 1.54  # median length of a normal vector of three dimensions, standard deviations
@@ -44,7 +45,10 @@ class RefinementSettings(Settings):
         default=2e-4, gt=0, description="least standard deviation of how a sample follows its bodies (extents)"
     )
     joint_sigma: float = Field(
-        default=8e-4, gt=0, description="standard deviation of the joints found before, against all sightings (extents)"
+        default=2e-3, gt=0, description="standard deviation of the joints found before, against all sightings (extents)"
+    )
+    least_slip: float = Field(
+        default=3e-4, gt=0, description="least standard deviation of how far a joint's bodies part (extents)"
     )
     blend_sigma: float = Field(
         default=1e-3, gt=0, description="misfit that is worth a change of the skin weights by one (extents)"
@@ -69,6 +73,7 @@ class RefinedMotion:
     linkage : Linkage
         In the pose of frame 0.
     bodies : BodyMotion
+        Not quite held together by the joints, see `looseness` of `adjust`.
     points : SkinPoints
         The samples in the pose of frame 0, with their skin weights.
     sigma : (N,) float, metres
@@ -79,6 +84,16 @@ class RefinedMotion:
     bodies: BodyMotion
     points: SkinPoints
     sigma: np.ndarray
+
+    def joint_positions(self) -> np.ndarray:
+        """Where the two bodies of each joint carry it, in the middle, (T, J, 3), metres, world."""
+        ends = self.linkage.hierarchy.joint_bodies
+        carried = [
+            np.einsum("tjik,jk->tji", self.bodies.rotations[:, ends[:, e]], self.linkage.joints)
+            + self.bodies.translations[:, ends[:, e]]
+            for e in (0, 1)
+        ]
+        return 0.5 * (carried[0] + carried[1])
 
 
 def refine_skeleton(
@@ -105,7 +120,8 @@ def refine_skeleton(
         return found, bodies
     linkage, motion = linkage_of(found)
     points = SkinPoints.of_weights(bodies.rest, bodies.weights)
-    refined = refine_motion(linkage, motion, points, paths, bodies.extent, settings)
+    misses = np.array([joint.miss for joint in found.joints])
+    refined = refine_motion(linkage, motion, points, paths, bodies.extent, settings, misses)
     bodies = replace(
         bodies,
         weights=refined.points.weights(bodies.body_count),
@@ -114,19 +130,19 @@ def refine_skeleton(
         rest=refined.points.rest,
     )
     middle = np.stack([bodies.rest[bodies.label == b].mean(axis=0) for b in range(bodies.body_count)])
+    centers, root = bodies.centers, linkage.hierarchy.root
+    # Bones that keep their length, their joints as near as can be to where bodies meet
+    places = refined.joint_positions()
+    offsets, _ = fit_offsets(linkage.hierarchy, bodies.rotations, centers[:, root], places, centers)
+    local = local_rotations(bodies.rotations, linkage.hierarchy)
+    places, _ = forward_kinematics(linkage.hierarchy, offsets, local, centers[:, root])
     skeleton = skeleton_of_motion(
-        linkage.hierarchy,
-        refined.linkage.joints,
-        bodies.rotations,
-        refined.linkage.joint_positions(refined.bodies),
-        bodies.centers,
-        middle,
-        found.skeleton.fps,
+        linkage.hierarchy, places[0], bodies.rotations, places, centers, middle, found.skeleton.fps
     )
     joints = tuple(
         replace(joint, point=point, axis=axis, hinge=bool(hinge))
         for joint, point, axis, hinge in zip(
-            found.joints, refined.linkage.joints, refined.linkage.axes, refined.linkage.hinge, strict=True
+            found.joints, places[0], refined.linkage.axes, refined.linkage.hinge, strict=True
         )
     )
     return MotionSkeleton(skeleton, joints, found.costs), bodies
@@ -153,6 +169,7 @@ def refine_motion(
     paths: MotionPaths,
     extent: float,
     settings: RefinementSettings | None = None,
+    misses: np.ndarray | None = None,
 ) -> RefinedMotion:
     """Find, by turns, skin weights and shape, and the motion of all frames together with the joints.
 
@@ -170,10 +187,15 @@ def refine_motion(
     extent : float, metres
         Of the subject.
     settings : RefinementSettings, optional
+    misses : (J,) float, metres, optional
+        How far the bodies, each by itself, carry each joint apart. A joint may slip by as much, and by what it still
+        does after each round: one that is none, as a body between was not found, doesn't bend its bodies' motion.
     """
     settings = settings or RefinementSettings()
     prior = JointPrior(linkage.joints, settings.joint_sigma * extent)
     least = settings.noise * extent
+    tightest = np.full(len(linkage.joints), settings.least_slip * extent)
+    looseness = tightest if misses is None else np.maximum(misses, tightest)
     bodies = body_motion(linkage, motion)
     sigma = _sample_sigma(bodies, points, paths, least)
     for k in range(settings.rounds):
@@ -187,7 +209,7 @@ def refine_motion(
         sigma = _sample_sigma(bodies, points, paths, least)
         if k == settings.rounds - 1:
             linkage = _with_hinges(linkage, motion, bodies, points, paths, sigma, settings.independence)
-            motion = joint_motion(linkage, bodies.rotations, motion.root)
+            motion = replace(joint_motion(linkage, bodies.rotations, motion.root), slip=motion.slip)
         # Motion and joints of the shape so far
         spread = np.broadcast_to(sigma[:, None] / np.sqrt(settings.independence), paths.seen.shape)
         adjusted = adjust(
@@ -197,10 +219,14 @@ def refine_motion(
             Observations.of_paths(paths.positions, spread),
             smoothness=smoothness_of(linkage, motion, extent, settings),
             joint_prior=prior,
+            looseness=looseness,
             cutoff=settings.cutoff,
             rounds=settings.steps,
         )
         linkage, motion, bodies = adjusted.linkage, adjusted.motion, adjusted.bodies
+        assert motion.slip is not None
+        slips = np.sqrt((motion.slip**2).sum(axis=2).mean(axis=0) / 3.0)
+        looseness = np.clip(slips, tightest, looseness)
     first = bodies.part(slice(0, 1)).carry(points.rest, points.bodies, points.shares)[0]
     return RefinedMotion(posed(linkage, bodies, 0), since(bodies, 0), replace(points, rest=first), sigma)
 

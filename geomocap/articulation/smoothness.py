@@ -104,11 +104,20 @@ def typical_accelerations(linkage: Linkage, motion: JointMotion) -> tuple[np.nda
     return np.array([sizes[0], *sizes[2:]]), float(sizes[1])
 
 
-def prior_terms(linkage: Linkage, motion: JointMotion, prior: Smoothness) -> tuple[np.ndarray, np.ndarray, float]:
-    """Weights (T - 2, D) and values (T - 2, D) of the accelerations, and their cost."""
+def prior_terms(
+    linkage: Linkage, motion: JointMotion, prior: Smoothness, looseness: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Weights (T - 2, D) and values (T - 2, D) of the accelerations, and their cost.
+
+    Where joints slip, the accelerations of their slips follow, with the standard deviations `looseness` (J,), metres.
+    """
     group = acceleration_groups(linkage)
     sigma = np.concatenate([[prior.turn[0], prior.shift], prior.turn[1:]])
     value = accelerations(linkage, motion)
+    if looseness is not None and motion.slip is not None:
+        group = np.concatenate([group, len(sigma) + np.repeat(np.arange(len(looseness)), 3)])
+        sigma = np.concatenate([sigma, looseness])
+        value = np.concatenate([value, np.diff(motion.slip, n=2, axis=0).reshape(len(value), -1)], axis=1)
     chi2 = np.zeros((len(value), len(sigma)))
     np.add.at(chi2.T, group, (value / sigma[group]).T ** 2)
     cost = float(0.5 * prior.cutoff**2 * np.log1p(chi2 / prior.cutoff**2).sum())

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from geomocap.articulation.adjustment import JointPrior, adjust
+from geomocap.articulation.adjustment import JointPrior, _system, adjust
 from geomocap.articulation.kinematics import Linkage, body_motion, joint_motion, moved_by, posed, since
 from geomocap.articulation.normal_kernel import normal_equations
 from geomocap.articulation.observations import Observations, SkinPoints
@@ -216,6 +216,55 @@ def test_shares_are_the_least_squares_ones():
         one = {"type": "eq", "fun": lambda w: w.sum() - 1.0}
         best = minimize(cost, present, bounds=allowed, constraints=one, options={"ftol": 1e-12})
         assert cost(found[n]) <= best.fun * 1.001 + 1e-9
+
+
+def test_right_sides_are_the_slopes_of_the_cost():
+    linkage, motion, points = linked(chain(4))
+    linkage = replace(linkage, hinge=np.array([True, False, True]))
+    sightings = Observations.of_paths(chain(4).positions, np.full((len(points), motion.frames), 0.01))
+    loose = np.array([0.01, 0.02, 0.03])
+    rng, size = np.random.default_rng(0), int(linkage.joint_dof[-1])
+    away = replace(motion, slip=rng.normal(0, 0.05, (motion.frames, 3, 3)))
+    away = moved_by(linkage, away, rng.normal(0, 0.05, (motion.frames, size + 9)))
+    priors = (None, None, JointPrior(linkage.joints + 0.01, 0.1), loose)
+    system = _system(linkage, away, points, sightings, priors, 3.0)
+
+    def cost(step, shift):
+        bent = replace(linkage, joints=linkage.joints + shift)
+        return _system(bent, moved_by(linkage, away, step), points, sightings, priors, 3.0).cost
+
+    for t, k in ((0, 0), (5, 4), (7, 6), (8, 8), (3, size), (4, size + 5), (23, size + 8)):
+        step = np.zeros((motion.frames, size + 9))
+        step[t, k] = 1e-6
+        slope = (cost(step, 0.0) - cost(-step, 0.0)) / 2e-6
+        np.testing.assert_allclose(-slope, system.right[t, k], rtol=1e-5, atol=1e-3)
+    for k in range(9):
+        shift = np.zeros((3, 3))
+        shift.flat[k] = 1e-6
+        slope = (cost(0.0 * step, shift) - cost(0.0 * step, -shift)) / 2e-6
+        np.testing.assert_allclose(-slope, system.corner_right[k], rtol=1e-5, atol=1e-3)
+
+
+def test_joint_that_is_none_does_not_bend_the_motion():
+    scene = chain(3)
+    linkage, _, points = linked(scene)
+    ends = scene.body != 1  # the body between was not found: its neighbours share no point
+    paths = MotionPaths(scene.positions[ends])
+    pair = Linkage(
+        Hierarchy(0, np.array([[0, 1]], np.int32)),
+        linkage.joints[1:],
+        linkage.axes[1:],
+        np.zeros(1, bool),
+        linkage.origin,
+    )
+    root = scene.rotations[:, 0] @ linkage.origin + scene.translations[:, 0]
+    start = joint_motion(pair, scene.rotations[:, [0, 2]], root)
+    skin = SkinPoints.of_weights(points.rest[ends], np.eye(2)[scene.body[ends] // 2])
+    held = refine_motion(pair, start, skin, paths, 1.3, RefinementSettings(rounds=1, least_slip=1e-6))
+    loose = refine_motion(pair, start, skin, paths, 1.3, misses=np.array([0.1]))
+    true = scene.rotations[:, [0, 2]]
+    assert turn_errors_deg(held.bodies.rotations, true).mean() > 1.0
+    assert turn_errors_deg(loose.bodies.rotations, true).mean() < 0.2
 
 
 def test_refined_skeleton_is_nearer_to_the_truth_and_keeps_its_bones():
