@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
@@ -16,6 +17,7 @@ from geomocap.articulation.normal_kernel import normal_equations
 from geomocap.articulation.observations import Observations, SkinPoints
 from geomocap.articulation.smoothness import PosePrior, Smoothness, pose_terms, prior_terms
 
+_FEW = 4  # frames that are not worth waking the other threads for
 _CHUNK = 64  # frames whose blocks are in memory at once
 _LEAST_DAMPING = 1e-6
 _MOST_DAMPING = 1e6
@@ -201,23 +203,28 @@ def _system(
     for low in range(0, frames, _CHUNK):
         some = slice(low, min(low + _CHUNK, frames))
         part = bodies.part(some)
-        matrix, sides, costs = normal_equations(
-            part.rotations,
-            part.translations,
-            _twists(linkage, motion.part(some), part, joint_prior is not None),
-            chain,
-            chain_start,
-            points.rest,
-            points.bodies,
-            points.shares,
-            observations.start[some.start : some.stop + 1],
-            observations.point,
-            observations.target,
-            observations.normal,
-            observations.isotropic,
-            observations.across,
-            cutoff,
-        )
+        threads = numba.get_num_threads()
+        numba.set_num_threads(threads if some.stop - some.start > _FEW else 1)
+        try:
+            matrix, sides, costs = normal_equations(
+                part.rotations,
+                part.translations,
+                _twists(linkage, motion.part(some), part, joint_prior is not None),
+                chain,
+                chain_start,
+                points.rest,
+                points.bodies,
+                points.shares,
+                observations.start[some.start : some.stop + 1],
+                observations.point,
+                observations.target,
+                observations.normal,
+                observations.isotropic,
+                observations.across,
+                cutoff,
+            )
+        finally:
+            numba.set_num_threads(threads)
         blocks[some], border[some] = matrix[:, :size, :size], matrix[:, :size, size:]
         right[some] = sides[:, :size]
         corner += matrix[:, size:, size:].sum(axis=0)

@@ -14,19 +14,31 @@ from numba import njit, prange
 @njit(cache=True, nogil=True)
 def _add_block(block: np.ndarray, x: np.ndarray, y: np.ndarray, weight: np.ndarray, factor: float) -> None:
     """Add factor S(x)ᵀ W S(y) with S(x) = [-[x]×, I], 3 × 6."""
-    sx = np.zeros((3, 6))
-    sy = np.zeros((3, 6))
-    for s, p in ((sx, x), (sy, y)):
-        s[0, 1], s[0, 2] = p[2], -p[1]
-        s[1, 0], s[1, 2] = -p[2], p[0]
-        s[2, 0], s[2, 1] = p[1], -p[0]
-        s[0, 3] = s[1, 4] = s[2, 5] = 1.0
-    for j in range(6):
-        w0 = factor * (weight[0, 0] * sy[0, j] + weight[0, 1] * sy[1, j] + weight[0, 2] * sy[2, j])
-        w1 = factor * (weight[1, 0] * sy[0, j] + weight[1, 1] * sy[1, j] + weight[1, 2] * sy[2, j])
-        w2 = factor * (weight[2, 0] * sy[0, j] + weight[2, 1] * sy[1, j] + weight[2, 2] * sy[2, j])
-        for i in range(6):
-            block[i, j] += sx[0, i] * w0 + sx[1, i] * w1 + sx[2, i] * w2
+    x0, x1, x2 = x[0], x[1], x[2]
+    y0, y1, y2 = y[0], y[1], y[2]
+    for i in range(3):
+        # row i of W, and of W S(y) for the turn; both go to the rows of S(x)ᵀ that they enter
+        w0, w1, w2 = factor * weight[i, 0], factor * weight[i, 1], factor * weight[i, 2]
+        t0, t1, t2 = w2 * y1 - w1 * y2, w0 * y2 - w2 * y0, w1 * y0 - w0 * y1
+        if i == 0:
+            upper, lower, up, low = 2, 1, -x1, x2
+        elif i == 1:
+            upper, lower, up, low = 0, 2, -x2, x0
+        else:
+            upper, lower, up, low = 1, 0, -x0, x1
+        block[3 + i, 0] += t0
+        block[3 + i, 1] += t1
+        block[3 + i, 2] += t2
+        block[3 + i, 3] += w0
+        block[3 + i, 4] += w1
+        block[3 + i, 5] += w2
+        for row, arm in ((upper, up), (lower, low)):
+            block[row, 0] += arm * t0
+            block[row, 1] += arm * t1
+            block[row, 2] += arm * t2
+            block[row, 3] += arm * w0
+            block[row, 4] += arm * w1
+            block[row, 5] += arm * w2
 
 
 @njit(cache=True, nogil=True)

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geomocap.articulation.adjustment import adjust
-from geomocap.articulation.kinematics import BodyMotion, JointMotion, Linkage, body_motion
+from geomocap.articulation.kinematics import JointMotion, Linkage, body_motion
 from geomocap.articulation.model import SubjectModel
 from geomocap.articulation.smoothness import PosePrior
 from geomocap.articulation.surface_matching import FrameSurface, MatchingScales, ModelSurface, match_surfaces, misfit
 
 HEADINGS = 12  # turns about the vertical from which the search starts
 TRIED = 32  # starts that are fitted
-KEPT = 5  # of these, fitted better
+KEPT = (6, 4, 3, 2)  # of these, fitted better and better
 _COARSE_POINTS = 300
 _COARSE_ROUNDS = 10
 _COARSE_TURN = 0.2  # radians: how far joints may leave a pose seen
@@ -25,45 +26,51 @@ _ANNEALING = (0.04, 0.02, 0.01, 0.0)  # standard deviation of the surface in the
 
 
 def find_pose(
-    model: SubjectModel, surface: ModelSurface, frame: FrameSurface, scales: MatchingScales, up: int
-) -> tuple[JointMotion, float]:
-    """Pose of a model in a frame of which nothing is known before, and its misfit.
+    model: SubjectModel, surface: ModelSurface, frames: Sequence[FrameSurface], scales: MatchingScales, up: int
+) -> tuple[int, JointMotion]:
+    """Frame in which a model fits best, of some of which nothing is known before, and its pose there.
 
     Starts are the poses that the model has been seen in, turned about the vertical and to the frame's principal axes,
     centre on centre. All are fitted at once with few points, their joints held near the pose seen; those of least
-    misfit again with all points and freer joints.
+    misfit, of all frames, again with all points and freer joints.
 
     Parameters
     ----------
     model : SubjectModel
     surface : ModelSurface
         Its points that are fitted.
-    frame : FrameSurface
+    frames : sequence of FrameSurface
     scales : MatchingScales
     up : int
         World axis that points up.
 
     Returns
     -------
+    int
+        Which of the frames.
     JointMotion
         Of one frame.
-    float
-        See `surface_matching.misfit`.
     """
+    linkage = model.linkage
     coarse = ModelSurface.of_model(model, _COARSE_POINTS, surface.colors is not None)
-    starts = _starts(model, coarse, frame, up)
-    starts = _best(starts, _misfits(model.linkage, starts, coarse, frame, scales), TRIED)
-    prior = PosePrior(starts, _COARSE_TURN, np.pi, model.extent)
     wide = replace(scales, sigma=max(_ANNEALING[0] * model.extent, scales.sigma))
-    found = fit_pose(model.linkage, starts, coarse, [frame] * starts.frames, wide, prior, _COARSE_ROUNDS)
-    found = _best(found, _misfits(model.linkage, found, coarse, frame, scales), KEPT)
-    prior = PosePrior(found, _FINE_TURN, np.pi, model.extent)
-    for share in _ANNEALING:
+    tried = []
+    for frame in frames:
+        starts = _starts(model, coarse, frame, up)
+        starts = _best(starts, _misfits(linkage, starts, coarse, [frame] * starts.frames, scales), TRIED)
+        prior = PosePrior(starts, _COARSE_TURN, np.pi, model.extent)
+        tried.append(fit_pose(linkage, starts, coarse, [frame] * starts.frames, wide, prior, _COARSE_ROUNDS))
+    found = JointMotion(*(np.concatenate([getattr(t, name) for t in tried]) for name in ("local", "root")))
+    number = np.repeat(np.arange(len(frames)), [t.frames for t in tried])
+    for share, kept in zip(_ANNEALING, KEPT, strict=True):
+        misfits = _misfits(linkage, found, surface, [frames[n] for n in number.tolist()], scales)
+        best = np.sort(np.argsort(misfits, kind="stable")[:kept])
+        found, number = JointMotion(found.local[best], found.root[best]), number[best]
+        prior = PosePrior(found, _FINE_TURN, np.pi, model.extent)
         sharper = replace(scales, sigma=max(share * model.extent, scales.sigma))
-        found = fit_pose(model.linkage, found, surface, [frame] * found.frames, sharper, prior, _FINE_ROUNDS)
-    misfits = _misfits(model.linkage, found, surface, frame, scales)
-    chosen = int(np.argmin(misfits))
-    return found.part(slice(chosen, chosen + 1)), float(misfits[chosen])
+        found = fit_pose(linkage, found, surface, [frames[n] for n in number.tolist()], sharper, prior, _FINE_ROUNDS)
+    chosen = int(np.argmin(_misfits(linkage, found, surface, [frames[n] for n in number.tolist()], scales)))
+    return int(number[chosen]), found.part(slice(chosen, chosen + 1))
 
 
 def fit_pose(
@@ -143,7 +150,11 @@ def _best(motion: JointMotion, misfits: np.ndarray, count: int) -> JointMotion:
 
 
 def _misfits(
-    linkage: Linkage, motion: JointMotion, surface: ModelSurface, frame: FrameSurface, scales: MatchingScales
+    linkage: Linkage,
+    motion: JointMotion,
+    surface: ModelSurface,
+    frames: Sequence[FrameSurface],
+    scales: MatchingScales,
 ) -> np.ndarray:
-    bodies: BodyMotion = body_motion(linkage, motion)
-    return np.array([misfit(posed, frame, scales) for posed in surface.posed(bodies)])
+    posed = surface.posed(body_motion(linkage, motion))
+    return np.array([misfit(one, frame, scales) for one, frame in zip(posed, frames, strict=True)])

@@ -13,6 +13,7 @@ from geomocap.articulation.model import SubjectModel
 from geomocap.articulation.observations import Observations, SkinPoints
 from geomocap.export.surface import shell_normals
 
+SOUGHT = 4  # points of a frame among which the model looks for its own, times those that look for the model
 _LEAST_OF_BODY = 25
 _SAME_SIDE = 0.2  # cosine of the normals' angle
 
@@ -60,6 +61,11 @@ class Surface:
     normals: np.ndarray
     colors: np.ndarray | None = None
 
+    def part(self, chosen: np.ndarray) -> Surface:
+        """Some of the points."""
+        colors = None if self.colors is None else self.colors[chosen]
+        return Surface(self.points[chosen], self.normals[chosen], colors)
+
     def features(self, scales: MatchingScales) -> np.ndarray:
         """Coordinates in which near points belong together."""
         parts = [self.points, scales.normal * self.normals]
@@ -75,13 +81,16 @@ class FrameSurface:
     Attributes
     ----------
     surface : Surface
+    sought : Surface
+        A part of the points, spread over all, among which points of the model look for their nearest.
     tree : cKDTree
-        Of the features.
+        Of its features.
     some : Surface
         A part of the points, spread over all, that looks for its own nearest points of the model.
     """
 
     surface: Surface
+    sought: Surface
     tree: cKDTree
     some: Surface
 
@@ -89,11 +98,11 @@ class FrameSurface:
     def of_points(
         cls, points: np.ndarray, colors: np.ndarray | None, spacing: float, scales: MatchingScales, count: int
     ) -> FrameSurface:
-        """Prepare the points of a frame; `count` of them look for the model."""
+        """Prepare the points of a frame; `count` of them look for the model, which looks for `SOUGHT` times as many."""
         surface = Surface(points, shell_normals(points, 2.0 * spacing), colors)
-        chosen = np.sort(np.random.default_rng(0).permutation(len(points))[:count])
-        some = Surface(points[chosen], surface.normals[chosen], colors[chosen] if colors is not None else None)
-        return cls(surface, cKDTree(surface.features(scales)), some)
+        order = np.random.default_rng(0).permutation(len(points))
+        some, sought = (surface.part(np.sort(order[:n])) for n in (count, SOUGHT * count))
+        return cls(surface, sought, cKDTree(sought.features(scales)), some)
 
 
 @dataclass(frozen=True)
@@ -158,8 +167,8 @@ def _match(posed: Surface, frame: FrameSurface, scales: MatchingScales) -> tuple
     nearest = frame.tree.query(features)[1]
     back = cKDTree(features).query(frame.some.features(scales))[1]
     point = np.concatenate([np.arange(len(features)), back])
-    target = np.concatenate([frame.surface.points[nearest], frame.some.points])
-    normal = np.concatenate([frame.surface.normals[nearest], frame.some.normals])
+    target = np.concatenate([frame.sought.points[nearest], frame.some.points])
+    normal = np.concatenate([frame.sought.normals[nearest], frame.some.normals])
     away = np.linalg.norm(posed.points[point] - target, axis=1)
     together = (away < scales.reach) & (np.einsum("ni,ni->n", posed.normals[point], normal) > _SAME_SIDE)
     weight = np.full(int(together.sum()), scales.independence / scales.sigma**2)

@@ -38,7 +38,7 @@ class TakeSettings(Settings):
     """How the model of a subject is followed through another take."""
 
     points: int = Field(default=1200, ge=100, description="points of the model, and of each frame, that are matched")
-    start_frames: int = Field(default=2, ge=1, description="frames in which the model is looked for")
+    start_frames: int = Field(default=4, ge=1, description="frames in which the model is looked for")
     steps: int = Field(default=8, ge=1, description="times that points are matched anew in each frame")
     rounds: int = Field(default=5, ge=0, description="rounds in which all frames are fitted together")
     normal: float = Field(default=0.03, ge=0, description="weight of normals in matching (extents)")
@@ -129,12 +129,11 @@ def track_take(
     surface = ModelSurface.of_model(model, settings.points, colored)
     # Where it is
     asked = np.unique(np.linspace(0, frames, settings.start_frames, endpoint=False).astype(int)).tolist()
-    found = [find_pose(model, surface, views[t], scales, up) for t in asked]
-    best = int(np.argmin([f[1] for f in found]))
+    best, pose = find_pose(model, surface, [views[t] for t in asked], scales, up)
     first = asked[best]
     progress(_STAGE, 1, frames + 1)
     # Frame by frame, both ways
-    pieces: dict[int, JointMotion] = {first: found[best][0]}
+    pieces: dict[int, JointMotion] = {first: pose}
     for order in (range(first + 1, frames), range(first - 1, -1, -1)):
         for t in order:
             back = 1 if order.step > 0 else -1

@@ -6,6 +6,7 @@ from geomocap.articulation.adjustment import adjust
 from geomocap.articulation.kinematics import BodyMotion, JointMotion, body_motion, posed, since
 from geomocap.articulation.model import SubjectModel, rotation_limits
 from geomocap.articulation.observations import Observations
+from geomocap.articulation.pose_search import find_pose
 from geomocap.articulation.smoothness import PosePrior
 from geomocap.articulation.surface_matching import FrameSurface, MatchingScales, ModelSurface, match_surfaces
 from geomocap.articulation.take_paths import attach_paths, turned_by_paths
@@ -188,6 +189,18 @@ def test_matches_are_the_nearest_points_of_the_same_side(model):
     away = found.target - surface.skin.rest[found.point]
     assert (np.abs(np.einsum("mi,mi->m", away, found.normal)) < 0.02).mean() > 0.95
     assert (np.einsum("mi,mi->m", surface.normals[found.point], found.normal) > 0.2).all()
+
+
+def test_pose_is_looked_for_in_all_frames_and_given_where_it_fits_best(model):
+    true, places = take_of(model)
+    scales = MatchingScales(0.03, 0.0, 0.1, SPACING, 0.05, 0.05)
+    ball = np.random.default_rng(1).normal(size=(2000, 3))
+    ball *= 0.4 / np.linalg.norm(ball, axis=1, keepdims=True)
+    frames = [FrameSurface.of_points(p, None, SPACING, scales, 400) for p in (ball, places[0])]
+    which, pose = find_pose(model, ModelSurface.of_model(model, 400, False), frames, scales, 2)
+    assert which == 1
+    turned = body_motion(model.linkage, pose).rotations[0]
+    assert np.rad2deg(turn_angles(turned.swapaxes(1, 2) @ true.rotations[0])).max() < 6.0
 
 
 def test_model_in_another_rest_pose_moves_alike(model):
