@@ -9,6 +9,7 @@ import numpy as np
 from geomocap.errors import GeometryError
 
 _LEAST_FRAMES = 2
+_GIVE = 0.001  # extents; what surfaces give although they belong to a rigid body
 
 
 @dataclass(frozen=True)
@@ -81,10 +82,16 @@ class MotionPaths:
         return np.median(stated, axis=1)
 
     def weights(self) -> np.ndarray:
-        """Weight of each position, (N, T) float: relative to the median variance, between 0 and 4; 0 where not seen."""
+        """Weight of each position, (N, T) float: 1 for the median precision, at most 4; 0 where not seen.
+
+        Surfaces are not rigid to better than a small share of their extent: more precise positions don't count more.
+        Where a body turns most its samples are known worst, and yet say most about it.
+        """
         if self.sigma is None:
             return self.seen.astype(float)
         sigma = np.broadcast_to(self.sigma if self.sigma.ndim == 2 else self.sigma[:, None], self.seen.shape)
         known = self.seen & np.isfinite(sigma) & (sigma > 0)
+        give = (_GIVE * self.extent) ** 2
         middle = float(np.median(sigma[known])) if known.any() else 1.0
-        return np.where(known, np.minimum((middle / np.where(known, sigma, 1.0)) ** 2, 4.0), self.seen * 0.25)
+        variance = np.where(known, sigma, middle) ** 2 + give
+        return np.where(known, np.minimum((middle**2 + give) / variance, 4.0), self.seen * 0.25)

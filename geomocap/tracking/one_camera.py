@@ -8,9 +8,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geomocap.tracking.frame_views import FrameViews
+from geomocap.tracking.patch_kernel import COHERENT
 from geomocap.tracking.patches import Alignment, Patches, align
 
-_DEPTH_PX = 3.0  # standard deviation of the depth, sample spacings
+DEPTH_PX = 3.0  # standard deviation of the depth, sample spacings
 _TURN = 0.15  # rad; a single view hardly shows turns out of its plane
 _NEIGHBOURS = 6  # whose median distance from the surface counts
 _REACH_VOXELS = 8.0  # farther away it is another surface
@@ -44,20 +45,21 @@ def align_alone(
         view,
         iterations=iterations,
         least_correlation=least_correlation,
-        prior_shift_px=_DEPTH_PX,
+        prior_shift_px=DEPTH_PX,
         prior_turn=_TURN,
     )
     image_sigma, sigma = found.image_sigma.copy(), found.sigma.copy()
     across = image_precision(patches, which, camera[which], found.correlation[which])
     image_sigma[which] = across
-    sigma[which] = np.sqrt((2 * across**2 + (_DEPTH_PX * patches.size[which]) ** 2) / 3)
+    sigma[which] = np.sqrt((2 * across**2 + (DEPTH_PX * patches.size[which]) ** 2) / 3)
     return replace(found, sigma=sigma, image_sigma=image_sigma)
 
 
 def image_precision(patches: Patches, which: np.ndarray, camera: np.ndarray, correlation: np.ndarray) -> np.ndarray:
     """Standard deviation along the surface in the direction that the texture tells least about, (A,) float, metres.
 
-    From the residuals that a correlation leaves and the structure tensor of the template's slopes along the surface.
+    From the residuals that a correlation leaves, counted as in `patch_kernel`, and the structure tensor of the
+    template's slopes along the surface.
 
     Parameters
     ----------
@@ -73,7 +75,8 @@ def image_precision(patches: Patches, which: np.ndarray, camera: np.ndarray, cor
     tensor = np.swapaxes(slopes, 1, 2) @ slopes
     weakest = np.linalg.eigvalsh(tensor)[:, 0]
     variance = (free[:, :, 0] ** 2).sum(axis=1) / count[:, 0]
-    residual = variance * np.maximum(1 - correlation * np.abs(correlation), 0.0) + _NOISE**2
+    misfit = variance * np.maximum(1 - correlation * np.abs(correlation), 0.0)
+    residual = misfit * np.maximum(COHERENT * count[:, 0], 1.0) + _NOISE**2
     return np.sqrt(residual / np.maximum(weakest, 1e-12))
 
 

@@ -14,7 +14,9 @@ in space that a camera sees now is the one vector g with these slopes that is or
 
 The Jacobian is thus formed once an alignment and not once an iteration (inverse composition: Baker, Matthews 2004,
 "Lucas–Kanade 20 years on"), and an iteration costs one interpolation a sample. Offset and gain are projected out of J.
-Cameras are weighted with their own residuals; standard deviations come from the inverse of the normal matrix.
+Cameras are weighted with their own residuals; standard deviations come from the inverse of the normal matrix. What
+residuals have beyond the noise of the images is what the model of a rigid piece of surface with a fixed texture misses,
+and that goes together over much of a patch: it counts as if only a few of the samples were independent.
 """
 
 from __future__ import annotations
@@ -39,6 +41,7 @@ LEAST_FACING = 0.2
 """Cosine between normal and viewing ray below which a sample is not used."""
 
 _FLOOR = 2.0  # noise of an image that even a perfect fit is granted, grey levels
+COHERENT = 0.15  # share of the samples over which residuals beyond that go together
 _GAIN = 3.0  # most contrast that an image may lose or win against the template
 
 
@@ -236,7 +239,8 @@ def _align_one(
             now[c] = product / math.sqrt(max(variance, 1e-3) * variance_t[c])
             gains[c] = min(max(product / max(variance, 1e-3), 1 / _GAIN), _GAIN)
             residual = max(variance_t[c] * (1 - now[c] * abs(now[c])), 0.0)
-            weights[c] = 1 / (residual * counts[c] / max(counts[c] - 8, 1) + _FLOOR**2)
+            misfit = residual * counts[c] / max(counts[c] - 8, 1)
+            weights[c] = 1 / (misfit * max(COHERENT * counts[c], 1.0) + _FLOOR**2)
             top = max(top, now[c])
         for c in range(C):
             if counts[c] == 0:

@@ -191,7 +191,7 @@ def renewed(patches: Patches, found: Alignment, good: np.ndarray, view: FrameVie
     stale = patches.has & good[:, None] & (found.by_camera > -1)
     if templates == "updated":
         stale &= found.by_camera < _NEW_TEMPLATE_CORRELATION
-    return with_templates(replace(patches, has=patches.has & ~stale), stale, view)
+    return with_templates(replace(patches, has=patches.has & ~stale), stale, view, found.image_sigma)
 
 
 def new_views(patches: Patches, found: Alignment, good: np.ndarray, view: FrameViews, slack_px: float) -> Patches:
@@ -201,7 +201,7 @@ def new_views(patches: Patches, found: Alignment, good: np.ndarray, view: FrameV
     cosine = facings(patches.positions, patches.normals, view)
     want = visible(patches, patches.positions, patches.frames, view, slack, _FACING) & ~patches.has
     want &= (cosine > _NEW_TEMPLATE_FACING) & sure[:, None]
-    return with_templates(patches, want, view) if want.any() else patches
+    return with_templates(patches, want, view, found.image_sigma) if want.any() else patches
 
 
 def _enough(state: Followed, found: Alignment, settings: TrackingSettings) -> np.ndarray:

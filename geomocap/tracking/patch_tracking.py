@@ -13,10 +13,11 @@ from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads
 from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.joining import join_broken
+from geomocap.tracking.lone_depths import adjust_depths
 from geomocap.tracking.patch_search import Followed, carry_lost, hiding_depth, judge, new_views, renewed, search
-from geomocap.tracking.patches import Patches, with_templates
+from geomocap.tracking.patches import Patches, doubted, with_templates
 from geomocap.tracking.reacquisition import reacquire
-from geomocap.tracking.seeding import seed_for_one_camera, seed_patches, seed_spacing
+from geomocap.tracking.seeding import patch_radius, seed_for_one_camera, seed_patches, seed_spacing
 from geomocap.tracking.track_record import TrackRecord
 from geomocap.tracking.tracking_settings import TrackingSettings
 from geomocap.tracking.trajectories import DOUBLE, LAST_FRAME, Trajectories
@@ -40,7 +41,8 @@ def track_surface(
     are followed forward; then those placed later backward to the first frame, until they have run for some frames
     beside an older one, with which they are joined. Frames come in order and two are held.
     Where the cameras are so few that two of them agree on less than a part (`one_camera_below`) of the first frame's
-    surface, the rest gets patches of single cameras, whose depth is that of the volume.
+    surface, the rest gets patches of single cameras. Their depth is that of the volume, adjusted to the motion of what
+    is around them.
 
     Parameters
     ----------
@@ -71,6 +73,7 @@ def track_surface(
     for k, view in _stream(frames, range(n_frames), executor, "track forward", progress):
         if state is None:
             spacing = seed_spacing(view, settings.n_patches)
+            settings = settings.model_copy(update={"radius_px": patch_radius(view, spacing, settings)})
         elif previous is not None:
             state = _next(state, previous, view, settings, record, k, spacing, forward=True)
         if k % settings.seed_every == 0:
@@ -87,7 +90,7 @@ def track_surface(
                 patches = patches.join(seed_for_one_camera(view, taken, spacing, settings, rng))
             fresh = Followed.begin(patches, np.arange(count, count + len(patches)), by_one)
             count += len(fresh.patches)
-            record.placed(k, fresh.identity, fresh.patches)
+            record.placed(k, fresh.identity, fresh.patches, view.centers)
             state = fresh if state is None else state.join(fresh)
             seeds[k] = _bare(fresh)
         previous = view
@@ -105,7 +108,8 @@ def track_surface(
             previous = view
         if state is not None:
             record.ended(state.identity, state.last_reason, forward=False)
-    return join_broken(record.trajectories(count))
+    found = record.trajectories(count)
+    return join_broken(adjust_depths(found, record.rays(count)) if by_one else found)
 
 
 def _stream(
@@ -136,6 +140,7 @@ def _bare(seeds: Followed) -> Followed:
         np.zeros((N, C, 0), np.uint8),
         patches.has,
         patches.hidden,
+        patches.doubt,
     )
     return Followed.begin(blank, seeds.identity, seeds.by_one)
 
@@ -163,19 +168,20 @@ def _next(
     found = search(state, previous, view, settings)
     reason = judge(state, found, view, settings)
     good = reason == LAST_FRAME
-    found = carry_lost(state, found, good)
+    found = carry_lost(state, doubted(state.patches, found), good)
     old = state.patches
     if frame % settings.seed_every == 0:
         carried = old.moved(found.positions, found.frames)
         again, seen, cameras = reacquire(carried, ~good, view, hiding_depth(old, view, settings.slack_px), settings)
         found, good = found.replaced(seen, again), good | seen
-        old = with_templates(old.moved(found.positions, found.frames), cameras, view).moved(old.positions, old.frames)
+        there = with_templates(old.moved(found.positions, found.frames), cameras, view, found.image_sigma)
+        old = there.moved(old.positions, old.frames)
     shift = found.positions - old.positions
     turn = Rotation.from_matrix(found.frames @ np.swapaxes(old.frames, 1, 2)).as_rotvec()
     gap = np.where(good, 0, state.gap + 1)
     moved = renewed(old.moved(found.positions, found.frames), found, good, view, settings.templates)
     moved = new_views(moved, found, good, view, settings.slack_px)
-    record.measured(frame, state.identity[good], found, np.flatnonzero(good))
+    record.measured(frame, state.identity[good], found, np.flatnonzero(good), view.centers)
     double = good & np.isin(state.identity, _beside_older(*record.at(frame), _DOUBLE * spacing))
     beside = np.where(double, state.beside + 1, 0)
     reason = np.where(beside >= _LONG_BESIDE, DOUBLE, reason)

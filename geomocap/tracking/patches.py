@@ -11,7 +11,7 @@ from geomocap.tracking.patch_kernel import align_patches
 from geomocap.tracking.patch_templates import take_templates
 
 _COARSE_STRIDE = 2  # of the samples, on blurred levels
-_OWN = ("positions", "frames", "shape", "size", "rows", "has", "hidden")
+_OWN = ("positions", "frames", "shape", "size", "rows", "has", "hidden", "doubt")
 
 
 @dataclass(frozen=True)
@@ -96,6 +96,8 @@ class Patches:
         Cameras with a template.
     hidden : (N, C) float
         Depth of the patch beyond the (hull's) surface when its template was taken, metres; NaN where there is none.
+    doubt : (N, C) float
+        Standard deviation that the patch's place had when its template was taken, metres.
     """
 
     positions: np.ndarray
@@ -107,6 +109,7 @@ class Patches:
     usable: np.ndarray
     has: np.ndarray
     hidden: np.ndarray
+    doubt: np.ndarray
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -133,6 +136,7 @@ class Patches:
             np.zeros((N, C, M), np.uint8),
             np.zeros((N, C), bool),
             np.full((N, C), np.nan),
+            np.zeros((N, C)),
         )
 
     def select(self, which: np.ndarray) -> Patches:
@@ -186,10 +190,11 @@ def facings(positions: np.ndarray, normals: np.ndarray, view: FrameViews) -> np.
     return np.einsum("nci,ni->nc", ray, normals) / np.linalg.norm(ray, axis=2)
 
 
-def with_templates(patches: Patches, want: np.ndarray, view: FrameViews) -> Patches:
+def with_templates(patches: Patches, want: np.ndarray, view: FrameViews, sigma: np.ndarray | None = None) -> Patches:
     """Take templates in the cameras `want` (N, C) bool that have none; where too little is seen there is none.
 
     The new patches share the large arrays of templates with those given, which have nothing in the places filled.
+    `sigma` (N,): standard deviation of their places, metres; 0 if not given, as where patches begin.
     """
     took = np.ascontiguousarray(want & ~patches.has, np.uint8)
     take_templates(
@@ -206,7 +211,18 @@ def with_templates(patches: Patches, want: np.ndarray, view: FrameViews) -> Patc
     )
     got = took != 0
     depth, surface = view.depths(patches.positions)
-    return replace(patches, has=patches.has | got, hidden=np.where(got, depth - surface, patches.hidden))
+    hidden = np.where(got, depth - surface, patches.hidden)
+    doubt = np.where(got, 0.0 if sigma is None else sigma[:, None], patches.doubt)
+    return replace(patches, has=patches.has | got, hidden=hidden, doubt=doubt)
+
+
+def doubted(patches: Patches, found: Alignment) -> Alignment:
+    """Add to standard deviations how well the places were known at which templates were taken: drift adds up."""
+    part = found.by_camera > -1
+    variance = np.where(part, patches.doubt**2, 0.0).sum(axis=1) / np.maximum(part.sum(axis=1), 1)
+    return replace(
+        found, sigma=np.sqrt(found.sigma**2 + variance), image_sigma=np.sqrt(found.image_sigma**2 + variance)
+    )
 
 
 def align(

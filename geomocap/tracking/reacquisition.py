@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from geomocap.tracking.frame_views import FrameViews
@@ -54,6 +56,7 @@ def reacquire(
         np.ascontiguousarray(np.repeat(some.usable[some.rows, best][:, None], C, axis=1)),
         seen,
         some.hidden,
+        some.doubt,
     )
     result = align(
         shared,
@@ -67,6 +70,8 @@ def reacquire(
         prior_shift_px=_FAR_PX,
         prior_turn=0.2,
     )
+    variance = result.sigma**2 + some.doubt[rows, best] ** 2
+    result = replace(result, sigma=np.sqrt(variance), image_sigma=np.sqrt(variance))
     agree = seen & (result.by_camera >= settings.camera_correlation)
     fits = (agree.sum(axis=1) >= settings.n_views) & (result.correlation >= _SURE)
     fits &= (result.sigma < settings.sigma_px * some.size) & view.may_be_subject(result.positions)

@@ -17,6 +17,8 @@ _HULL_SLACK = 3.0  # voxels that a seed may lie behind the drawn surface
 _REGULAR = 1e-12
 _ROUNDS = 3
 _PACKING = 0.7  # points placed at random at least r apart, as many as fit: 0.7 a square of r
+_NOISE_SHARE = 0.4  # of the standard deviation allowed that a patch has in the very image it comes from
+_LEAST_RADIUS_PX = 3  # smaller patches hold too little texture
 _COVER = 1.0  # half the width of a patch, as a share of the spacing: neighbours overlap
 _PEAK_PX = 3.0  # half the width of a peak of correlation along the ray, pixels
 _CLEAR = 0.05  # correlation by which it must exceed all others
@@ -38,6 +40,15 @@ def image_reduction(view: FrameViews, settings: TrackingSettings) -> int:
         return 1
     pixel = float(np.median(view.pixel_size(view.surface)))
     return max(1, round(_COVER * seed_spacing(view, settings.n_patches) / (settings.radius_px * pixel)))
+
+
+def patch_radius(view: FrameViews, spacing: float, settings: TrackingSettings) -> int:
+    """Return half the width of patches `spacing` (m) apart in pixels: they cover the surface twice, and no more.
+
+    Between three and `radius_px`: wider ones reach round the limbs of a subject that is small in the images.
+    """
+    pixel = float(np.median(view.pixel_size(view.surface)))
+    return min(settings.radius_px, max(_LEAST_RADIUS_PX, round(_COVER * spacing / pixel)))
 
 
 def spread(points: np.ndarray, spacing: float, taken: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -98,7 +109,7 @@ def surface_frames(view: FrameViews, points: np.ndarray) -> tuple[np.ndarray, np
         slopes = np.stack([-fit[:, 1], -fit[:, 2], np.ones(len(fit))], axis=1)
         normals = np.einsum("nij,nj->ni", frames, slopes / np.linalg.norm(slopes, axis=1, keepdims=True))
     positions = points + fit[:, :1] * frames[:, :, 2]
-    return positions, frames, np.clip(fit[:, 3:], -0.25 / radius, 0.25 / radius)
+    return positions, frames, np.clip(fit[:, 3:], -0.5 / radius, 0.5 / radius)
 
 
 def patch_shape(curvature: np.ndarray, size: np.ndarray, radius_px: int) -> np.ndarray:
@@ -166,7 +177,8 @@ def seed_for_one_camera(
     blank, seen, cosine = _blank(points, view, settings, least_views=1, facing=_FACING_ALONE)
     patches, reference = _of_best_camera(blank, seen, cosine, view)
     keep = np.flatnonzero(patches.has.any(axis=1))
-    fits = image_precision(patches, keep, reference[keep], np.ones(len(keep))) < settings.sigma_px * patches.size[keep]
+    noise = image_precision(patches, keep, reference[keep], np.ones(len(keep)))
+    fits = noise < _NOISE_SHARE * settings.sigma_px * patches.size[keep]
     return patches.select(keep[fits])
 
 
@@ -222,6 +234,7 @@ def _lock(
         np.ascontiguousarray(np.repeat(patches.usable[patches.rows, reference][:, None], C, axis=1)),
         seen,
         patches.hidden,
+        patches.doubt,
     )
     others = seen.copy()
     others[rows, reference] = False

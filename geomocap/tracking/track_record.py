@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geomocap.tracking.one_camera import DEPTH_PX
 from geomocap.tracking.patches import Alignment, Patches
 from geomocap.tracking.trajectories import LAST_FRAME, Trajectories
 
@@ -23,6 +24,7 @@ class _Measured:
     sigma: np.ndarray
     correlation: np.ndarray
     n_views: np.ndarray
+    rays: np.ndarray
 
 
 class TrackRecord:
@@ -34,8 +36,11 @@ class TrackRecord:
         self._placed: list[tuple[int, np.ndarray, np.ndarray]] = []
         self._ends: list[tuple[bool, np.ndarray, np.ndarray]] = []
 
-    def measured(self, frame: int, identity: np.ndarray, found: Alignment, rows: np.ndarray) -> None:
-        """Keep what was found of patches `identity` (A,), which are the `rows` (A,) of an alignment."""
+    def measured(
+        self, frame: int, identity: np.ndarray, found: Alignment, rows: np.ndarray, centers: np.ndarray
+    ) -> None:
+        """Keep what cameras at `centers` found of patches `identity` (A,), the `rows` (A,) of an alignment."""
+        alone = np.where(found.n_views[rows] == 1, found.by_camera[rows].argmax(axis=1), -1)
         self._measured.append(
             _Measured(
                 frame,
@@ -45,6 +50,7 @@ class TrackRecord:
                 found.sigma[rows],
                 found.correlation[rows],
                 found.n_views[rows],
+                _rays(found.positions[rows], alone, centers),
             )
         )
 
@@ -59,17 +65,28 @@ class TrackRecord:
             np.concatenate([m.frames[:, :, 2] for m in here]),
         )
 
-    def placed(self, frame: int, identity: np.ndarray, patches: Patches) -> None:
-        """Keep new patches: their templates fit themselves, to a tenth of a pixel."""
+    def placed(self, frame: int, identity: np.ndarray, patches: Patches, centers: np.ndarray) -> None:
+        """Keep new patches: their templates fit themselves, to a tenth of a pixel; a single camera sees no depth."""
         self._placed.append((frame, identity, patches.frames))
         views = patches.has.sum(axis=1)
         one = np.ones(len(patches))
-        sigma = _PLACED_PX * patches.size
-        self._measured.append(_Measured(frame, identity, patches.positions, patches.frames, sigma, one, views))
+        alone = np.where(views == 1, patches.has.argmax(axis=1), -1)
+        blind = np.where(views == 1, np.sqrt((2 * _PLACED_PX**2 + DEPTH_PX**2) / 3), _PLACED_PX)
+        rays = _rays(patches.positions, alone, centers)
+        self._measured.append(
+            _Measured(frame, identity, patches.positions, patches.frames, blind * patches.size, one, views, rays)
+        )
 
     def ended(self, identity: np.ndarray, reason: np.ndarray, forward: bool) -> None:
         """Keep why patches are followed no further."""
         self._ends.append((forward, identity, reason))
+
+    def rays(self, count: int) -> np.ndarray:
+        """Return unit vectors from the only camera to each patch; 0 where not just one saw it: (count, T, 3)."""
+        rays = np.zeros((count, self.n_frames, 3))
+        for m in self._measured:
+            rays[m.identity, m.frame] = m.rays
+        return rays
 
     def trajectories(self, count: int) -> Trajectories:
         """Return all `count` trajectories."""
@@ -89,3 +106,9 @@ class TrackRecord:
         for forward, identity, reason in self._ends:
             (end if forward else begin)[identity] = reason
         return Trajectories(positions, rotations, sigma, correlation, n_views, first[:, :, 2], placed, end, begin)
+
+
+def _rays(positions: np.ndarray, camera: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    """Unit vectors (A, 3) to positions (A, 3) from cameras (A,); 0 for camera −1."""
+    ray = positions - centers[camera]
+    return np.where(camera[:, None] < 0, 0.0, ray / np.linalg.norm(ray, axis=1, keepdims=True))

@@ -27,7 +27,7 @@ class TrackingSettings(Settings):
     """
 
     n_patches: int = Field(4000, ge=10, le=100_000, description="Patches placed on a frame's whole surface")
-    radius_px: int = Field(5, ge=2, le=20, description="Half the width of a patch (pixels)")
+    radius_px: int = Field(5, ge=2, le=20, description="Half the width of a patch, at most (pixels)")
     reduction: int | None = Field(
         None, ge=1, le=16, description="Reduction of the images; so that patches cover the surface twice if not given"
     )
@@ -49,7 +49,7 @@ class TrackingSettings(Settings):
     one_camera_up_to: int = Field(
         5, ge=0, description="Most cameras of such captures: many cameras that disagree look at what isn't there"
     )
-    sigma_px: float = Field(0.2, gt=0, description="Largest standard deviation of a position (pixels on the patch)")
+    sigma_px: float = Field(0.5, gt=0, description="Largest standard deviation of a position (pixels on the patch)")
     slack_px: float = Field(8.0, gt=0, description="Depth, beyond two voxels, of what hides a patch (pixels on it)")
     neighbour_px: float = Field(3.0, gt=0, description="Largest distance from where neighbours' motion puts it (px)")
     longest_gap: int = Field(60, ge=0, description="Frames that a lost patch is carried along by its neighbours")

@@ -298,3 +298,12 @@ def test_a_small_body_is_one_if_others_hang_together_by_it(three, halved, bodies
     kept = (three.body != halved) | (np.arange(len(three.body)) % 2 == 0)
     settings = MotionBodiesSettings(min_share=0.22)  # of the samples 2/5, 2/5 and 1/5
     assert find_motion_bodies(MotionPaths(three.positions[kept]), settings).body_count == bodies
+
+
+def test_precision_beyond_what_surfaces_give_hardly_counts():
+    positions = np.zeros((3, 2, 3))
+    positions[1:, :, 0] = [[1.0], [2.0]]
+    paths = MotionPaths(positions, sigma=np.array([1e-5, 1e-4, 0.1]))  # 2 m long: surfaces give 2 mm
+    precise, usual, poor = paths.weights()[:, 0]
+    assert usual == 1.0 and 1.0 < precise < 1.01
+    np.testing.assert_allclose(poor, 0.002**2 / 0.1**2, rtol=0.01)

@@ -13,8 +13,16 @@ from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.patch_kernel import align_patches
 from geomocap.tracking.patch_search import renewed
 from geomocap.tracking.patch_tracking import track_surface
-from geomocap.tracking.patches import Patches, align, with_templates
-from geomocap.tracking.seeding import image_reduction, patch_shape, seed_patches, seed_spacing, spread, surface_frames
+from geomocap.tracking.patches import Patches, align, doubted, with_templates
+from geomocap.tracking.seeding import (
+    image_reduction,
+    patch_radius,
+    patch_shape,
+    seed_patches,
+    seed_spacing,
+    spread,
+    surface_frames,
+)
 from geomocap.tracking.tracking_settings import TrackingSettings
 from geomocap.tracking.trajectories import REASONS
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
@@ -89,6 +97,14 @@ def test_images_are_reduced_until_patches_cover_the_surface_twice(views):
     spacing, pixel = seed_spacing(views[0], 100), np.median(views[0].pixel_size(views[0].surface))
     assert image_reduction(views[0], few) == round(spacing / (2 * pixel)) == 6
     assert image_reduction(views[0], few.model_copy(update={"n_patches": 20_000})) == 1
+
+
+def test_patches_are_as_wide_as_their_distance_within_bounds(views):
+    pixel = np.median(views[0].pixel_size(views[0].surface))
+    settings = TrackingSettings(radius_px=6)
+    widths = [patch_radius(views[0], px * pixel, settings) for px in (1.0, 4.2, 20.0)]
+    assert widths == [3, 4, 6]
+    assert patch_radius(views[0], pixel, TrackingSettings(radius_px=2)) == 2
 
 
 def test_pixel_size_is_depth_by_focal_length(views):
@@ -205,7 +221,8 @@ def reference_step(patches, n, X, Q, view, level, size):
         gain = np.cov(T, grey)[0, 1] / np.var(grey, ddof=1)
         A = np.c_[gain * J, np.ones(len(T)), T - T.mean()]
         residual = T - gain * grey
-        s2 = np.var((T - T.mean()) - gain * (grey - grey.mean())) * len(T) / (len(T) - 8) + 4
+        misfit = np.var((T - T.mean()) - gain * (grey - grey.mean())) * len(T) / (len(T) - 8)
+        s2 = misfit * 0.15 * len(T) + 4
         full, right = A.T @ A / s2, A.T @ residual / s2
         schur = full[:6, 6:] @ np.linalg.inv(full[6:, 6:])
         N += full[:6, :6] - schur @ full[6:, :6]
@@ -291,6 +308,21 @@ def test_templates_are_taken_again_as_asked(scene, views, seeds, templates, shar
     if templates == "updated":
         assert not taken[every % 2 == 0].any()
     assert abs(taken[good].mean() - share) < 0.1
+
+
+def test_a_patch_is_known_no_better_than_when_its_templates_were_taken(scene, views, seeds):
+    X, Q = moved(scene, seeds, 1)
+    every = np.arange(len(seeds))
+    found = align(seeds, every, X, Q, seeds.has, views[1], iterations=(4, 4), least_correlation=0.6)
+    good = np.isfinite(found.sigma) & seeds.has.any(axis=1)
+    assert np.array_equal(doubted(seeds, found).sigma, found.sigma)  # new patches are where they are
+    copy = seeds.select(every).join(Patches.empty(81, 6, 2))
+    later = renewed(copy.moved(found.positions, found.frames), found, good, views[1], "previous")
+    again = align(later, every, X, Q, later.has, views[1], iterations=(4, 4), least_correlation=0.6)
+    both = doubted(later, again)
+    fresh = good & ((later.doubt > 0) == (again.by_camera > -1)).all(axis=1)
+    assert fresh.sum() > 50
+    assert_allclose(both.sigma[fresh], np.hypot(again.sigma, found.sigma)[fresh])
 
 
 def test_tracking_repeats_bit_for_bit(views):

@@ -1,0 +1,81 @@
+"""Depths of patches that one camera alone sees, adjusted to what is around them."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from geomocap.tracking.lone_depths import adjust_depths
+from geomocap.tracking.trajectories import Trajectories
+
+FRAMES = 12
+DEPTH_STD = 0.012
+SIDES = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])  # far cameras, 90° apart
+
+
+def limb() -> tuple[Trajectories, np.ndarray, np.ndarray]:
+    """A cylinder that swings and turns: true trajectories, those with depths off, and lines of sight."""
+    rng = np.random.default_rng(3)
+    angle, height = rng.uniform(0, 2 * np.pi, 160), rng.uniform(-0.15, 0.15, 160)
+    body = np.stack([0.05 * np.cos(angle), 0.05 * np.sin(angle), height], axis=1)
+    swing = np.linspace(0, 1, FRAMES)
+    turns = Rotation.from_rotvec(np.stack([0.6 * swing, 0.2 * swing, 0.5 * swing], axis=1)).as_matrix()
+    truth = np.einsum("tij,nj->nti", turns, body) + swing[:, None] * [0.1, 0.05, 0]
+    # each patch is seen by the camera that it faces at first
+    side = SIDES[(body[:, :2] @ SIDES[:, :2].T).argmax(axis=1)]
+    rays = -np.repeat(side[:, None], FRAMES, axis=1)
+    drift = np.sin(np.arange(FRAMES)[None] * 0.9 + 3 * side[:, :1] + 5 * side[:, 1:2])  # as a hull's surface moves
+    off = DEPTH_STD * (drift + 0.5 * rng.normal(size=(160, FRAMES)))
+    N = len(truth)
+    zeros, ones = np.zeros(N, int), np.ones((N, FRAMES))
+    tracks = Trajectories(
+        truth + off[:, :, None] * rays,
+        np.repeat(turns[None], N, axis=0),
+        ones * DEPTH_STD / np.sqrt(3),
+        ones,
+        ones.astype(int),
+        side,
+        zeros,
+        zeros,
+        zeros,
+    )
+    return tracks, truth, rays
+
+
+@pytest.fixture(scope="module")
+def scene():
+    tracks, truth, rays = limb()
+    return tracks, truth, rays, adjust_depths(tracks, rays)
+
+
+def wobble(positions, truth, rays):
+    """RMS of the error along the line of sight, without its mean over time."""
+    error = ((positions - truth) * rays).sum(axis=2)
+    return np.sqrt(((error - error.mean(axis=1, keepdims=True)) ** 2).mean())
+
+
+def test_depths_come_to_move_as_the_rigid_limb_does(scene):
+    tracks, truth, rays, adjusted = scene
+    assert wobble(adjusted.positions, truth, rays) < 0.4 * wobble(tracks.positions, truth, rays)
+
+
+def test_patches_move_along_their_lines_of_sight_only(scene):
+    tracks, _, rays, adjusted = scene
+    moved = adjusted.positions - tracks.positions
+    along = (moved * rays).sum(axis=2)[:, :, None] * rays
+    assert_allclose(moved, along, atol=1e-12)
+    assert np.abs(along).max() > 0.5 * DEPTH_STD
+
+
+def test_what_several_cameras_see_stays(scene):
+    tracks, _, rays, _ = scene
+    some = rays.copy()
+    some[::2] = 0
+    positions = tracks.positions.copy()
+    positions[5, 3:6] = np.nan
+    gaps = tracks.without(np.isnan(positions[:, :, 0]))
+    some[np.isnan(positions[:, :, 0])] = 0
+    adjusted = adjust_depths(gaps, some)
+    assert_allclose(adjusted.positions[::2], gaps.positions[::2])
+    assert np.isnan(adjusted.positions[5, 3:6]).all() and np.isfinite(adjusted.positions[4]).all()
+    assert adjust_depths(tracks, np.zeros_like(rays)) is tracks
