@@ -87,7 +87,7 @@ def adjust(
     joint_prior : JointPrior, optional
         Joints are unknowns, too; without it they stay.
     looseness : (J,) float, metres, optional
-        Standard deviation of the joints' slips and of their accelerations; without it joints hold.
+        Standard deviation of the joints' slips, which also change slowly; without it joints hold.
     cutoff : float
         Residuals of this many standard deviations count half (Cauchy).
     rounds : int

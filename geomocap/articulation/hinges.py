@@ -49,6 +49,8 @@ def turn_information(
 def find_hinges(linkage: Linkage, motion: JointMotion, information: np.ndarray, sightings: np.ndarray) -> Linkage:
     """Linkage in which those joints are hinges whose turns about other axes the sightings don't show.
 
+    The axes of the other joints are those about which most of their turns are.
+
     A ball has two degrees of freedom more in each frame, a hinge has two for its axis. By the Bayesian information
     criterion it is a hinge if Σ φᵀ I φ over the turns φ about other axes is less than (2 T - 2) log n.
 
@@ -67,8 +69,7 @@ def find_hinges(linkage: Linkage, motion: JointMotion, information: np.ndarray, 
         axis, off = hinge_axis(motion.local[:, child], information[:, j])
         chi2 = float(np.einsum("ti,tij,tj->", off, information[:, j], off))
         hinge[j] = chi2 <= (2 * motion.frames - 2) * np.log(max(float(sightings[j]), np.e))
-        if hinge[j]:
-            axes[j] = axis
+        axes[j] = axis
     return replace(linkage, axes=axes, hinge=hinge)
 
 

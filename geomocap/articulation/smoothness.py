@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from geomocap.articulation.kinematics import JointMotion, Linkage
 
+_STEADY = 0.3  # accelerations of slips against the slips: these come and go slowly
+
 
 @dataclass(frozen=True)
 class Smoothness:
@@ -109,14 +111,15 @@ def prior_terms(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Weights (T - 2, D) and values (T - 2, D) of the accelerations, and their cost.
 
-    Where joints slip, the accelerations of their slips follow, with the standard deviations `looseness` (J,), metres.
+    Where joints slip, the accelerations of their slips follow; `looseness` (J,), metres, are the slips' standard
+    deviations.
     """
     group = acceleration_groups(linkage)
     sigma = np.concatenate([[prior.turn[0], prior.shift], prior.turn[1:]])
     value = accelerations(linkage, motion)
     if looseness is not None and motion.slip is not None:
         group = np.concatenate([group, len(sigma) + np.repeat(np.arange(len(looseness)), 3)])
-        sigma = np.concatenate([sigma, looseness])
+        sigma = np.concatenate([sigma, _STEADY * looseness])
         value = np.concatenate([value, np.diff(motion.slip, n=2, axis=0).reshape(len(value), -1)], axis=1)
     chi2 = np.zeros((len(value), len(sigma)))
     np.add.at(chi2.T, group, (value / sigma[group]).T ** 2)

@@ -260,11 +260,11 @@ def test_joint_that_is_none_does_not_bend_the_motion():
     root = scene.rotations[:, 0] @ linkage.origin + scene.translations[:, 0]
     start = joint_motion(pair, scene.rotations[:, [0, 2]], root)
     skin = SkinPoints.of_weights(points.rest[ends], np.eye(2)[scene.body[ends] // 2])
-    held = refine_motion(pair, start, skin, paths, 1.3, RefinementSettings(rounds=1, least_slip=1e-6))
+    held = refine_motion(pair, start, skin, paths, 1.3)
     loose = refine_motion(pair, start, skin, paths, 1.3, misses=np.array([0.1]))
     true = scene.rotations[:, [0, 2]]
-    assert turn_errors_deg(held.bodies.rotations, true).mean() > 1.0
-    assert turn_errors_deg(loose.bodies.rotations, true).mean() < 0.2
+    assert turn_errors_deg(held.bodies.rotations, true).mean() > 5.0
+    assert turn_errors_deg(loose.bodies.rotations, true).mean() < 0.1
 
 
 def test_refined_skeleton_is_nearer_to_the_truth_and_keeps_its_bones():
