@@ -23,7 +23,6 @@ _ROUNDS = 6
 _LOOSE = 1 / 3  # distance at which companions count half, in standard deviations of the depths
 _KEEPS = 1 / 6  # standard deviation of the shape that companions keep, in the same
 _SHARE = 2.0  # weight of all companions together
-_LEFT = 0.5  # of the standard deviation of depths that the adjustment leaves
 _FAR = 1.5  # depths that differ by more from the volume's lose it, standard deviations
 
 
@@ -59,7 +58,7 @@ def adjust_depths(tracks: Trajectories, rays: np.ndarray) -> Trajectories:
     Returns
     -------
     Trajectories
-        With smaller standard deviations there.
+        Their standard deviations stay: what is wrong with a depth in all frames alike is not seen.
     """
     has, alone = tracks.measured, rays.any(axis=2)
     if not alone.any():
@@ -89,8 +88,7 @@ def adjust_depths(tracks: Trajectories, rays: np.ndarray) -> Trajectories:
             count[edges] += 1
         offset = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-12)[:, None], shape.offset)
         shape = replace(shape, offset=offset, spread=np.sqrt(square / np.maximum(count, 1)))
-    sigma = np.where(alone, _LEFT * tracks.sigma, tracks.sigma)
-    return replace(tracks, positions=np.where(has[:, :, None], positions, np.nan), sigma=sigma)
+    return replace(tracks, positions=np.where(has[:, :, None], positions, np.nan))
 
 
 def _first_shape(

@@ -44,7 +44,8 @@ def test_they_follow_the_surface_and_state_how_well(tracks):
     error, stated = np.array(error)[late], tracks.sigma[late]
     # a pixel is 4 mm, a voxel 10 mm, and the ellipsoid shifts by 22 mm and turns by 4° a frame
     assert np.median(error) < 0.006 and np.percentile(error, 95) < 0.03
-    assert 0.2 < np.median(error) / (1.54 * np.median(stated)) < 2
+    # how the volume is wrong in all frames alike is stated too, and on an ellipsoid it isn't
+    assert 0.1 < np.median(error) / (1.54 * np.median(stated)) < 2
 
 
 def test_precision_is_that_of_least_squares_in_two_dimensions(views):
