@@ -226,7 +226,9 @@ def track_nodes(
     x, R, covariance, lost = (np.stack([f[k] for f in fine], axis=1) for k in range(4))
     if settings.part_rounds and not len(known):
         targets = [Target(frame, scales, settings.normal_weight) for frame in frames]
-        parts, covariance = find_rigid_parts(model.graph, targets, x, R, 1.5 * model.spacing, settings, executor)
+        parts, covariance = find_rigid_parts(
+            model.graph, targets, x, R, reference, 1.5 * model.spacing, settings, executor
+        )
         x, R = parts.carry(model.graph.nodes)
     x[lost] = np.nan
     return NodeTracks(x, R, covariance, reference, model.graph.nodes, model.graph.edges)

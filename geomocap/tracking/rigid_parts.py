@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numba import njit
-from scipy.sparse import csr_matrix, identity
+from scipy.sparse import csr_matrix, diags, identity
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -23,6 +22,8 @@ from geomocap.tracking.deformation import rotation_of
 from geomocap.tracking.node_graph import NodeGraph
 from geomocap.tracking.node_settings import NodeTrackingSettings
 from geomocap.tracking.part_grouping import MotionForms, group_nodes
+from geomocap.tracking.part_motion import RigidParts, part_equations, part_motions
+from geomocap.tracking.part_selection import choose_parts, follow_bearings, touching, without_weakest
 
 _FORM_SCALE = 0.6  # node spacings
 _MISFIT_SCALE = 0.3
@@ -31,41 +32,12 @@ _UNSEEN = 0.05  # least weight of a sample that no point supports
 _RESTING_FRAMES = 0.95  # a node may rest if points suit it in so many of the frames,
 _RESTING_SUPPORT = 0.7  # and support it so well, relative to how it was followed
 _RESTING_SHARE = 0.05  # least share of the nodes that rest side by side
-_TOGETHER = 0.025  # what it costs a node to be of another part than all its neighbours, as a share of being off
 _RINGS = 2  # a node may belong to the parts of nodes so many edges away
-_FIRST = (0.8, 0.6, 0.5, 0.4)  # node spacings
+_LOOKED_AT = 10  # frames that say which part a node follows
+_FIRST = (0.8, 0.6, 0.5, 0.4, 0.4, 0.3)  # node spacings
 _AGAIN = (0.5, 0.4, 0.3)
+_ASTRAY = 0.01  # a part leaves the motion it had in the frame before for one that misses less by so much
 _FORMS = ("R", "t", "form", "slope", "cost", "weight")
-
-
-@dataclass(frozen=True)
-class RigidParts:
-    """B rigid parts of a surface of N nodes in T frames.
-
-    Attributes
-    ----------
-    label : (N,) int
-        Part of each node.
-    R, t : (B, T, 3, 3), (B, T, 3) float, metres
-        position = R @ reference + t.
-    rests : (B,) bool
-        Parts that stay where they are in all frames, as a robot's base does.
-    """
-
-    label: np.ndarray
-    R: np.ndarray
-    t: np.ndarray
-    rests: np.ndarray
-
-    def carry(self, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (N, T, 3) and rotations (N, T, 3, 3) of nodes (N, 3)."""
-        R = self.R[self.label]
-        return (R @ nodes[:, None, :, None])[..., 0] + self.t[self.label], R
-
-    def at_rest(self, rests: np.ndarray) -> RigidParts:
-        """Let parts rest, (B,) bool."""
-        turns = np.where(rests[:, None, None, None], np.eye(3), self.R)
-        return RigidParts(self.label, turns, np.where(rests[:, None, None], 0.0, self.t), rests)
 
 
 class PartTracker:
@@ -79,9 +51,9 @@ class PartTracker:
         i, j = graph.edges.T
         near = csr_matrix((np.ones(len(i)), (i, j)), (N, N))
         self.near = csr_matrix(near + near.T + identity(N))
-        self.near_count = np.asarray(self.near.sum(axis=1))
+        self.mean = csr_matrix(diags(1 / np.asarray(self.near.sum(axis=1)).ravel()) @ self.near)
 
-    def find(self, x: np.ndarray, R: np.ndarray, each: Callable[..., list]) -> RigidParts:
+    def find(self, x: np.ndarray, R: np.ndarray, reference: int, each: Callable[..., list]) -> RigidParts:
         """Find the parts of nodes at x (N, T, 3) with rotations R (N, T, 3, 3), and their motions.
 
         What may rest does: of a shaft that stands still below another, nothing is seen of whether it turns with it.
@@ -98,11 +70,55 @@ class PartTracker:
         rests = 2 * np.bincount(label, still) > np.bincount(label)
         parts = part_motions(label, g.nodes, x, R, 0.3 * g.spacing).at_rest(rests)
         for scales in (_FIRST, _AGAIN)[: s.part_rounds]:
-            parts = self._settled(parts, x, R, each, frames)
-            moved = each(lambda k, p=parts, c=scales: self.register(k, p, c), frames)
-            parts = replace(parts, R=np.stack([m[0] for m in moved], 1), t=np.stack([m[1] for m in moved], 1))
-            x, R = parts.carry(g.nodes)
-        return self._settled(parts, x, R, each, frames)
+            parts = self.follow(parts, reference, scales, each)
+            for _ in range(2):
+                allowed = (self.near @ (self.near @ np.eye(len(parts.R))[parts.label])) > 0
+                chosen = choose_parts(parts.label, self.costs(parts, allowed, each), parts.rests, self.mean)
+                parts = replace(parts, label=chosen).compact()
+            parts = self.reduced(parts, each)
+            beside = touching(parts.label, g.edges, len(parts.R))
+            cost = self.costs(parts, beside[parts.label], each)
+            parts = replace(parts, label=follow_bearings(parts.label, cost, parts.R, parts.rests, g)).compact()
+        return parts
+
+    def reduced(self, parts: RigidParts, each: Callable[..., list]) -> RigidParts:
+        """Leave out parts that are not needed, one after the other."""
+        while len(parts.R) > 1:
+            beside = touching(parts.label, self.graph.edges, len(parts.R))
+            label = without_weakest(parts.label, self.costs(parts, beside[parts.label], each), beside, parts.rests)
+            if label is None:
+                break
+            parts = replace(parts, label=label).compact()
+        return parts
+
+    def follow(
+        self, parts: RigidParts, reference: int, scales: Sequence[float], each: Callable[..., list]
+    ) -> RigidParts:
+        """Register the parts to frame after frame, from the reference frame on, forwards and backwards.
+
+        Each part starts from where it is expected, where it was last, and where it was followed, and takes what misses
+        fewest points: a bar that turns on a disc sticks to it as a skin, but from the frame before it finds its place.
+        """
+        R, t = parts.R.copy(), parts.t.copy()
+        R[:, reference], t[:, reference] = np.eye(3), 0.0
+        middles = _means(self.graph.nodes, parts.label, len(R))
+        own = parts.label[self.owner]
+        sample = np.arange(len(own))
+
+        def one_way(way: int) -> None:
+            for k in range(reference + way, R.shape[1] if way > 0 else -1, way):
+                now, last = k - way, k - way * min(2, abs(k - reference))
+                expected = _expected(R[:, now], t[:, now], R[:, last], t[:, last], middles)
+                starts = [expected, (R[:, now], t[:, now]), (parts.R[:, k], parts.t[:, k])]
+                found = [self.register(k, parts, *start, scales) for start in starts]
+                missed = np.stack([_mean_of(self.misses(k, *motion, sample, own), own, len(R)) for motion in found])
+                missed[-1] += _ASTRAY
+                best, rows = missed.argmin(axis=0), np.arange(len(R))
+                R[:, k] = np.stack([f[0] for f in found])[best, rows]
+                t[:, k] = np.stack([f[1] for f in found])[best, rows]
+
+        each(one_way, [1, -1])
+        return replace(parts, R=R, t=t)
 
     def resting(self, forms: MotionForms, at_rest: MotionForms) -> np.ndarray:
         """Nodes (N,) that points suit as well if they stay where they are, `at_rest`, as the way they were followed."""
@@ -112,34 +128,22 @@ class PartTracker:
         more = np.sort(at_rest.cost / weight - forms.cost / followed, axis=1)[:, worst]
         support = np.sort(at_rest.weight / followed, axis=1)[:, T - 1 - worst]
         still = (more < (self.settings.part_misfit * self.graph.spacing) ** 2) & (support > _RESTING_SUPPORT)
-        still = 2 * (self.near @ still.astype(float)) > self.near_count.ravel()
+        still = self.mean @ still.astype(float) > 0.5
         beside = connected_components(self.near[still][:, still], directed=False)[1]
         still[still] = np.bincount(beside)[beside] >= _RESTING_SHARE * N
         return still
 
-    def _settled(
-        self, parts: RigidParts, x: np.ndarray, R: np.ndarray, each: Callable[..., list], frames: list[int]
-    ) -> RigidParts:
-        """Let each node belong to the part near it whose motion suits it and its neighbours best."""
-        near = np.zeros((len(x), len(parts.R)))
-        near[np.arange(len(x)), parts.label] = 1.0
-        for _ in range(_RINGS):
-            near = self.near @ near
-        allowed = near > 0
+    def costs(self, parts: RigidParts, allowed: np.ndarray, each: Callable[..., list]) -> np.ndarray:
+        """What it costs nodes to follow parts, `allowed` (N, B): 0 to 1, infinite where not allowed, (N, B)."""
+        T = parts.R.shape[1]
         sample, part = np.nonzero(allowed[self.owner])
-        miss = np.mean(each(lambda k: self.misses(k, parts, sample, part), frames), axis=0)
+        frames = list(range(0, T, max(1, T // _LOOKED_AT)))
+        missed = each(lambda k: self.misses(k, parts.R[:, k], parts.t[:, k], sample, part), frames)
         total, count = np.zeros(allowed.shape), np.zeros(allowed.shape)
-        np.add.at(total, (self.owner[sample], part), miss)
+        np.add.at(total, (self.owner[sample], part), np.mean(missed, axis=0))
         np.add.at(count, (self.owner[sample], part), 1)
         cost = np.where(count > 0, total / np.maximum(count, 1), 1.0)
-        cost = np.where(count > 0, 0.5 * cost + 0.5 * (self.near @ cost) / self.near_count, np.inf)
-        label = parts.label
-        nothing_known = ~np.isfinite(cost).any(axis=1)
-        for _ in range(3):
-            beside = (self.near @ np.eye(len(parts.R))[label]) / self.near_count
-            label = np.where(nothing_known, label, (cost - _TOGETHER * beside).argmin(axis=1))
-        kept, label = np.unique(label, return_inverse=True)
-        return part_motions(label, self.graph.nodes, x, R, 0.3 * self.graph.spacing).at_rest(parts.rests[kept])
+        return np.where(allowed, 0.5 * cost + 0.5 * (self.mean @ cost), np.inf)
 
     def forms(self, frame: int, x: np.ndarray, R: np.ndarray, along: float = _ALONG) -> MotionForms:
         """What a frame's points know of the motion of each node; lengths in metres.
@@ -183,21 +187,24 @@ class PartTracker:
         of_motion = np.linalg.inv(form / variance[:, None, None] + free / (count * slide)[:, None, None])
         return moves @ of_motion[label] @ moves.swapaxes(1, 2) + floor * np.eye(3)
 
-    def misses(self, frame: int, parts: RigidParts, sample: np.ndarray, part: np.ndarray) -> np.ndarray:
-        """How far samples (n,) are from a frame's points if carried by parts (n,), robustly, 0 to 1."""
+    def misses(self, frame: int, R: np.ndarray, t: np.ndarray, sample: np.ndarray, part: np.ndarray) -> np.ndarray:
+        """How far samples (n,) are from a frame's points if carried by parts (n,), robustly, 0 to 1.
+
+        R (B, 3, 3) and t (B, 3) are the parts' motions.
+        """
         g, points = self.graph, self.targets[frame].points
         c = max(_MISFIT_SCALE * g.spacing, self.closest)
-        R = parts.R[part, frame]
-        y = (R @ g.samples[sample][..., None])[..., 0] + parts.t[part, frame]
-        n = (R @ g.normals[sample][..., None])[..., 0]
+        y = (R[part] @ g.samples[sample][..., None])[..., 0] + t[part]
+        n = (R[part] @ g.normals[sample][..., None])[..., 0]
         tree = cKDTree(np.hstack([points.positions, c * points.normals]))
         distance = tree.query(np.hstack([y, c * n]), distance_upper_bound=3 * c)[0]
         return 1 - np.exp(-0.5 * np.minimum(distance / c, 3.0) ** 2)
 
-    def register(self, frame: int, parts: RigidParts, scales: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        """Fit the parts' motions R (B, 3, 3), t (B, 3) to a frame; at borders both parts hold on to each other."""
-        g, s, target = self.graph, self.settings, self.targets[frame]
-        label, R, t = parts.label, parts.R[:, frame], parts.t[:, frame]
+    def register(
+        self, frame: int, parts: RigidParts, R: np.ndarray, t: np.ndarray, scales: Sequence[float]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Fit the parts' motions to a frame, from R (B, 3, 3), t (B, 3) on; at borders, parts hold each other."""
+        g, s, target, label = self.graph, self.settings, self.targets[frame], parts.label
         free = np.repeat(~parts.rests, 6)
         hinges = g.edges[label[g.edges[:, 0]] != label[g.edges[:, 1]]]
         lengths = np.linalg.norm(g.nodes[hinges[:, 0]] - g.nodes[hinges[:, 1]], axis=1)
@@ -224,108 +231,12 @@ class PartTracker:
         return R, t
 
 
-@njit(cache=True, nogil=True)
-def part_equations(R, t, middle, label, samples, binding, weights, A, b, nodes, hinges, hold):
-    """Normal equations H (6B, 6B), right side (6B,) of the parts' steps: turn about the middle, and shift.
-
-    Parameters
-    ----------
-    R, t, middle : (B, 3, 3), (B, 3), (B, 3) float
-        Motions since the reference, and centres of the parts in the frame.
-    label : (N,) int
-        Parts of the nodes.
-    samples, binding, weights : (S, 3), (S, K), (S, K)
-        Samples in the reference, the nodes that carry them, and their shares.
-    A, b : (S, 3, 3), (S, 3) float
-        Weights of the samples' positions, and weights times errors.
-    nodes : (N, 3) float
-        In the reference.
-    hinges : (E, 2) int
-        Pairs of nodes of different parts: both parts carry both nodes to the same places, with weight `hold` (E,).
-    """
-    B = len(R)
-    H = np.zeros((6 * B, 6 * B))
-    g = np.zeros(6 * B)
-    K = binding.shape[1]
-    J = np.zeros((K, 3, 6))
-    AJ = np.zeros((3, 6))
-    part = np.empty(K, np.int64)
-    for s in range(len(samples) + 2 * len(hinges)):
-        hinge = s >= len(samples)
-        if hinge:
-            e, side = (s - len(samples)) // 2, (s - len(samples)) % 2
-            p = nodes[hinges[e, side]]
-            used = 2
-        else:
-            e, side = 0, 0
-            p = samples[s]
-            used = K
-        e0, e1, e2 = 0.0, 0.0, 0.0
-        for k in range(used):
-            if hinge:
-                part[k] = label[hinges[e, k]]
-                w = 1.0 - 2.0 * k
-            else:
-                part[k] = label[binding[s, k]]
-                w = weights[s, k]
-            q = part[k]
-            y0 = R[q, 0, 0] * p[0] + R[q, 0, 1] * p[1] + R[q, 0, 2] * p[2] + t[q, 0]
-            y1 = R[q, 1, 0] * p[0] + R[q, 1, 1] * p[1] + R[q, 1, 2] * p[2] + t[q, 1]
-            y2 = R[q, 2, 0] * p[0] + R[q, 2, 1] * p[1] + R[q, 2, 2] * p[2] + t[q, 2]
-            e0, e1, e2 = e0 + w * y0, e1 + w * y1, e2 + w * y2
-            a0, a1, a2 = w * (y0 - middle[q, 0]), w * (y1 - middle[q, 1]), w * (y2 - middle[q, 2])
-            # dy/dturn = −[a]ₓ, dy/dshift = w
-            J[k, 0, 1], J[k, 0, 2], J[k, 0, 3] = a2, -a1, w
-            J[k, 1, 0], J[k, 1, 2], J[k, 1, 4] = -a2, a0, w
-            J[k, 2, 0], J[k, 2, 1], J[k, 2, 5] = a1, -a0, w
-        for k in range(used):
-            first = 6 * part[k]
-            for n in range(6):
-                if hinge:
-                    g[first + n] -= hold[e] * (J[k, 0, n] * e0 + J[k, 1, n] * e1 + J[k, 2, n] * e2)
-                    for m in range(3):
-                        AJ[m, n] = hold[e] * J[k, m, n]
-                else:
-                    g[first + n] -= J[k, 0, n] * b[s, 0] + J[k, 1, n] * b[s, 1] + J[k, 2, n] * b[s, 2]
-                    for m in range(3):
-                        AJ[m, n] = A[s, m, 0] * J[k, 0, n] + A[s, m, 1] * J[k, 1, n] + A[s, m, 2] * J[k, 2, n]
-            for h in range(used):
-                second = 6 * part[h]
-                for m in range(6):
-                    for n in range(6):
-                        H[second + m, first + n] += (
-                            J[h, 0, m] * AJ[0, n] + J[h, 1, m] * AJ[1, n] + J[h, 2, m] * AJ[2, n]
-                        )
-    return H, g
-
-
-def part_motions(label: np.ndarray, nodes: np.ndarray, x: np.ndarray, R: np.ndarray, arm: float) -> RigidParts:
-    """Fit rigid motions to groups of nodes by Kabsch's method; a node's rotation counts as points `arm` metres from it.
-
-    Parameters
-    ----------
-    label : (N,) int
-    nodes, x, R : (N, 3), (N, T, 3), (N, T, 3, 3) float
-        Reference positions, positions and rotations.
-    """
-    B, T = int(label.max()) + 1, x.shape[1]
-    turns, shifts = np.empty((B, T, 3, 3)), np.empty((B, T, 3))
-    for b in range(B):
-        own = label == b
-        start, middle = nodes[own].mean(axis=0), x[own].mean(axis=0)
-        moment = np.einsum("ntc,nd->tcd", x[own] - middle, nodes[own] - start) + arm**2 * R[own].sum(axis=0)
-        U, _, Vt = np.linalg.svd(moment)
-        U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-        turns[b] = U @ Vt
-        shifts[b] = middle - turns[b] @ start
-    return RigidParts(label, turns, shifts, np.zeros(B, bool))
-
-
 def find_rigid_parts(
     graph: NodeGraph,
     targets: Sequence[Target],
     x: np.ndarray,
     R: np.ndarray,
+    reference: int,
     closest: float,
     settings: NodeTrackingSettings,
     executor: Executor,
@@ -339,6 +250,8 @@ def find_rigid_parts(
         Points of each frame.
     x, R : (N, T, 3), (N, T, 3, 3) float
         Nodes as they were followed.
+    reference : int
+        The frame from which motions are counted.
     closest : float, metres
         Least distance at which a point loses its weight.
     settings : NodeTrackingSettings
@@ -359,7 +272,7 @@ def find_rigid_parts(
         return list(map_items(work, frames, executor))
 
     tracker = PartTracker(graph, each(turned, list(range(len(targets)))), closest, settings)
-    parts = tracker.find(x, R, each)
+    parts = tracker.find(x, R, reference, each)
     return parts, np.stack(each(lambda k: tracker.covariance(k, parts), list(range(len(targets)))), axis=1)
 
 
@@ -371,6 +284,19 @@ def _either(chosen: np.ndarray, first: MotionForms, second: MotionForms) -> Moti
     """The first's forms of the nodes chosen, (N,) bool, the second's of the others."""
     pairs = ((getattr(first, name), getattr(second, name)) for name in _FORMS)
     return MotionForms(*(np.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
+
+
+def _expected(
+    R: np.ndarray, t: np.ndarray, before_R: np.ndarray, before_t: np.ndarray, middles: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Go on as from the motion before (B, 3, 3), (B, 3): the same turn about the middles (B, 3), the same shift."""
+    turn = R @ before_R.swapaxes(1, 2) @ R
+    now, last = (np.einsum("bij,bj->bi", a, middles) + b for a, b in ((R, t), (before_R, before_t)))
+    return turn, 2 * now - last - np.einsum("bij,bj->bi", turn, middles)
+
+
+def _mean_of(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
+    return np.bincount(group, values, count) / np.maximum(np.bincount(group, minlength=count), 1)
 
 
 def _means(x: np.ndarray, label: np.ndarray, count: int) -> np.ndarray:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from geomocap.tracking.node_settings import NodeTrackingSettings
 from geomocap.tracking.nodes import track_nodes
 from geomocap.tracking.part_grouping import MotionForms, group_nodes, motion_of, twist_of
-from geomocap.tracking.rigid_parts import part_equations, part_motions
+from geomocap.tracking.part_motion import part_equations, part_motions
 
 FRAMES = 9
 SMALL = NodeTrackingSettings(nodes=180, coarse_nodes=60, points=1500, coarse_points=800)

@@ -1,0 +1,165 @@
+"""Which rigid part each node of a surface follows, and which parts there are, by what it costs to follow each of them.
+
+Costs are shares between 0 and 1 by which points miss a node that a part carries, (N, B); infinite where the part is no
+candidate for the node.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from geomocap.tracking.node_graph import NodeGraph
+
+_TOGETHER = 0.025  # what it costs a node to be of another part than all its neighbours
+_FAITHFUL = 0.01  # a node leaves its part only for one that suits it by so much better,
+_AT_REST = 0.005  # and a part that rests for one that suits it by so much better than another would have to
+_CLEAR = 0.1  # a node that costs so much more clearly is of another part
+_CLEAR_NODES = 4  # a part stays if so many nodes clearly are not of the one beside it,
+_MEAN_COST = 0.03  # or if all of them cost so much more on average,
+_SHARED_COST = 0.005  # but must cost no more at all where they would go to several
+_ALIKE = 0.03  # parts whose costs differ by less suit a node alike
+_CONCAVE = 0.35  # turn of the normals towards each other across an edge that is a crease, as a sine
+_FLAT = 0.5  # a round solid is flat if it is so high, relative to its width
+_LEAST = 6  # nodes of such a solid
+
+
+def choose_parts(label: np.ndarray, cost: np.ndarray, rests: np.ndarray, mean: csr_matrix) -> np.ndarray:
+    """Let each node follow the part that suits it and its neighbours best; where all suit alike, it stays.
+
+    Parameters
+    ----------
+    label : (N,) int
+        Parts of the nodes so far.
+    cost : (N, B) float
+    rests : (B,) bool
+        Parts that stay where they are.
+    mean : (N, N) sparse
+        Averages over neighbours, rows summing to 1.
+
+    Returns
+    -------
+    (N,) int
+    """
+    one = np.eye(cost.shape[1])
+    cost = cost - _FAITHFUL * one[label] - _AT_REST * rests
+    for _ in range(3):
+        label = (cost - _TOGETHER * (mean @ one[label])).argmin(axis=1)
+    return label
+
+
+def without_weakest(label: np.ndarray, cost: np.ndarray, beside: np.ndarray, rests: np.ndarray) -> np.ndarray | None:
+    """Give the nodes of the weakest part to the parts beside it; None: every part is needed.
+
+    A part is not needed if a neighbour's motion suits its nodes, or if those of several neighbours do without any loss:
+    what was split because it slid in itself, as a round piece may, comes together again. What rests goes to what rests.
+
+    Parameters
+    ----------
+    label : (N,) int
+    cost : (N, B) float
+    beside : (B, B) bool
+        Parts that touch.
+    rests : (B,) bool
+
+    Returns
+    -------
+    (N,) int or None
+    """
+    B = cost.shape[1]
+    own = cost[np.arange(len(label)), label]
+    more = np.where(np.isfinite(cost), cost, 1.0) - own[:, None]
+    of_part = np.eye(B)[label].T
+    count = np.maximum(of_part.sum(axis=1), 1.0)
+    usable = beside & ~np.eye(B, dtype=bool) & (rests | ~rests[:, None])
+    clear = np.where(usable, of_part @ (more > _CLEAR), np.inf)
+    mean = np.where(usable, of_part @ more / count[:, None], np.inf)
+    part, into = np.unravel_index(np.lexsort((mean.ravel(), clear.ravel()))[0], mean.shape)
+    if clear[part, into] < _CLEAR_NODES and mean[part, into] <= _MEAN_COST:
+        return np.where(label == part, into, label)
+    more[np.arange(len(label)), label] = np.inf
+    more[~usable[label]] = np.inf
+    best = np.minimum(more.min(axis=1), 1.0)
+    mean_best = np.where(of_part @ (best > _CLEAR) < _CLEAR_NODES, of_part @ best / count, np.inf)
+    part = mean_best.argmin()
+    return np.where(label == part, more.argmin(axis=1), label) if mean_best[part] <= _SHARED_COST else None
+
+
+def follow_bearings(
+    label: np.ndarray, cost: np.ndarray, R: np.ndarray, rests: np.ndarray, graph: NodeGraph
+) -> np.ndarray:
+    """Let flat round solids turn with what stands on them, as turntables and wheels do.
+
+    Of a solid that is round about the axis of two parts' turn against each other, the points don't say which of the two
+    it belongs to. A shaft may well stand still below what turns; a disc is there in order to turn. A solid ends at
+    creases: nodes that both parts suit are split where the surface is concave.
+
+    Parameters
+    ----------
+    label : (N,) int
+    cost : (N, B) float
+        Of the parts that touch a node's own part.
+    R : (B, T, 3, 3) float
+        Rotations of the parts.
+    rests : (B,) bool
+    graph : NodeGraph
+
+    Returns
+    -------
+    (N,) int
+    """
+    label, B = label.copy(), cost.shape[1]
+    N = len(label)
+    i, j = graph.edges.T
+    normals = graph.normals[cKDTree(graph.samples).query(graph.nodes)[1]]
+    along = graph.nodes[j] - graph.nodes[i]
+    smooth = ((normals[j] - normals[i]) * along).sum(axis=1) > -_CONCAVE * graph.lengths
+    solid = csr_matrix(coo_matrix((np.ones(int(smooth.sum())), (i[smooth], j[smooth])), (N, N)))
+    beside = touching(label, graph.edges, B)
+    size = np.bincount(label, minlength=B)
+    # the greatest first; what rests is the greatest
+    order = np.lexsort((size, rests))[::-1]
+    for rank, ground in enumerate(order):
+        for mover in order[rank + 1 :]:
+            if not beside[ground, mover]:
+                continue
+            known = np.isin(label, (ground, mover)) & np.isfinite(cost[:, [ground, mover]]).all(axis=1)
+            alike = known.copy()
+            alike[known] = np.abs(cost[known, ground] - cost[known, mover]) < _ALIKE
+            on_top = ~alike & (label == mover)
+            if not alike.any() or not on_top.any():
+                continue
+            touched = np.zeros(N, bool)
+            touched[i[on_top[j]]] = touched[j[on_top[i]]] = True
+            axis = _axis(R[mover] @ R[ground].swapaxes(1, 2))
+            rows = np.flatnonzero(alike)
+            piece = connected_components(solid[rows][:, rows], directed=False)[1]
+            for k in np.unique(piece[touched[rows]]):
+                nodes = rows[piece == k]
+                if len(nodes) >= _LEAST and _height_to_width(graph.nodes[nodes], axis) < _FLAT:
+                    label[nodes] = mover
+    return label
+
+
+def touching(label: np.ndarray, edges: np.ndarray, count: int) -> np.ndarray:
+    """Which of `count` parts have neighbouring nodes, (B, B) bool, each part touching itself."""
+    beside = np.eye(count, dtype=bool)
+    i, j = label[edges].T
+    beside[i, j] = beside[j, i] = True
+    return beside
+
+
+def _axis(turns: np.ndarray) -> np.ndarray:
+    """Unit vector about which rotations (T, 3, 3) turn most, least squares."""
+    w = np.stack([turns[:, 2, 1] - turns[:, 1, 2], turns[:, 0, 2] - turns[:, 2, 0], turns[:, 1, 0] - turns[:, 0, 1]], 1)
+    return np.linalg.eigh(w.T @ w)[1][:, 2]
+
+
+def _height_to_width(points: np.ndarray, axis: np.ndarray) -> float:
+    """Extent of points (n, 3) along an axis through their middle, relative to their diameter about it."""
+    away = points - points.mean(axis=0)
+    height = away @ axis
+    radius = np.linalg.norm(away - height[:, None] * axis, axis=1).max()
+    return float(np.ptp(height) / max(2 * radius, 1e-12))
