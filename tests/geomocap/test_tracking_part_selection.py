@@ -59,7 +59,7 @@ def test_a_part_goes_to_several_only_without_loss():
     assert without_weakest(label, cost, ALL_BESIDE, NONE_REST) is None
 
 
-def test_what_rests_is_not_given_to_what_moves():
+def test_what_rests_is_not_given_to_a_smaller_part_that_moves():
     label = np.repeat([0, 1, 2], 10)
     cost = np.where(np.eye(3, dtype=bool)[label], 0.2, 0.6)
     cost[label == 2, 1] = 0.2
