@@ -54,8 +54,8 @@ def without_weakest(label: np.ndarray, cost: np.ndarray, beside: np.ndarray, res
     """Give the nodes of the weakest part to the parts beside it; None: every part is needed.
 
     A part is not needed if a neighbour's motion suits its nodes, or if those of several neighbours do without any loss:
-    what was split because it slid in itself, as a round piece may, comes together again. What rests isn't given
-    to a smaller part that moves.
+    what was split because it slid in itself, as a round piece may, comes together again. A base that
+    rests, the greatest of all parts, isn't given to what moves.
 
     Parameters
     ----------
@@ -74,7 +74,8 @@ def without_weakest(label: np.ndarray, cost: np.ndarray, beside: np.ndarray, res
     more = np.where(np.isfinite(cost), cost, 1.0) - own[:, None]
     of_part = np.eye(B)[label].T
     count = np.maximum(of_part.sum(axis=1), 1.0)
-    fits = rests | ~rests[:, None] | (count > count[:, None])
+    base = rests & (count == count.max())
+    fits = rests | ~base[:, None]
     usable = beside & ~np.eye(B, dtype=bool) & fits
     clear = np.where(usable, of_part @ (more > _CLEAR), np.inf)
     mean = np.where(usable, of_part @ more / count[:, None], np.inf)

@@ -59,12 +59,13 @@ def test_a_part_goes_to_several_only_without_loss():
     assert without_weakest(label, cost, ALL_BESIDE, NONE_REST) is None
 
 
-def test_what_rests_is_not_given_to_a_smaller_part_that_moves():
+def test_a_base_that_rests_is_not_given_to_what_moves():
     label = np.repeat([0, 1, 2], 10)
     cost = np.where(np.eye(3, dtype=bool)[label], 0.2, 0.6)
     cost[label == 2, 1] = 0.2
     assert without_weakest(label, cost, ALL_BESIDE, np.array([True, False, True])) is None
     assert without_weakest(label, cost, ALL_BESIDE, np.array([True, True, True])) is not None
+    assert without_weakest(label[:26], cost[:26], ALL_BESIDE, np.array([False, False, True])) is not None
 
 
 def test_a_part_that_does_not_touch_is_no_candidate():
