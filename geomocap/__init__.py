@@ -3,7 +3,12 @@
 Data flows one way: capture → geometry → segmentation → skeleton → files and pictures.
 """
 
+import os
 from importlib.metadata import PackageNotFoundError, version
+
+# Threads without work sleep instead of spinning: on a machine that does other things too, spinning makes short kernels
+# several times slower. Read when OpenMP is loaded.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numba
 
