@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geomocap.tracking.frame_views import FrameViews
+from geomocap.tracking.ghosts import nothing_behind
 from geomocap.tracking.one_camera import image_precision
 from geomocap.tracking.patches import Patches, align, facings, with_templates
 from geomocap.tracking.tracking_settings import TrackingSettings
@@ -170,12 +171,15 @@ def seed_for_one_camera(
 ) -> Patches:
     """Place new patches where a frame's surface has none, each for the camera that sees it best.
 
-    They stay on the surface as it is given. Parameters as for `seed_patches`.
+    They stay on the surface as it is given, and only where this must be what the camera sees. Parameters as for
+    `seed_patches`.
     """
     there = view.surface[cKDTree(view.surface).query(taken)[1]]
     points = view.surface[spread(view.surface, spacing, there, rng)]
     blank, seen, cosine = _blank(points, view, settings, least_views=1, facing=_FACING_ALONE)
-    patches, reference = _of_best_camera(blank, seen, cosine, view)
+    seen &= nothing_behind(view, blank.positions)
+    some = seen.any(axis=1)
+    patches, reference = _of_best_camera(blank.select(np.flatnonzero(some)), seen[some], cosine[some], view)
     keep = np.flatnonzero(patches.has.any(axis=1))
     noise = image_precision(patches, keep, reference[keep], np.ones(len(keep)))
     fits = noise < _NOISE_SHARE * settings.sigma_px * patches.size[keep]
