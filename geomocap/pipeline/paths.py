@@ -12,7 +12,7 @@ from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.tracking.nodes import track_nodes
 from geomocap.tracking.selection import spread_out
 
-SAMPLES = 1500  # motion paths that bodies are found from
+SAMPLES = 2000  # motion paths that bodies are found from
 LEAST_SAMPLES = 300  # fewer long trajectories than these don't cover a subject: nodes are tracked instead
 LEAST_COVERAGE = 0.4  # nor do trajectories that are measured, on average, in a smaller share of the frames
 ANCHORS = 2000  # trajectories that keep nodes from sliding
