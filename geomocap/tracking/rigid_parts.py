@@ -75,21 +75,25 @@ class PartTracker:
                 allowed = (self.near @ (self.near @ np.eye(len(parts.R))[parts.label])) > 0
                 chosen = choose_parts(parts.label, self.costs(parts, allowed, each), parts.rests, self.mean)
                 parts = replace(parts, label=chosen).compact()
-            parts = self.reduced(parts, each)
-            beside = touching(parts.label, g.edges, len(parts.R))
-            cost = self.costs(parts, beside[parts.label], each)
-            parts = replace(parts, label=follow_bearings(parts.label, cost, parts.R, parts.rests, g)).compact()
+            if parts.rests.any():
+                parts = self.needed(parts, each)
         return parts
 
-    def reduced(self, parts: RigidParts, each: Callable[..., list]) -> RigidParts:
-        """Leave out parts that are not needed, one after the other."""
+    def needed(self, parts: RigidParts, each: Callable[..., list]) -> RigidParts:
+        """Leave out parts that are not needed, one after the other, and let flat round solids turn with what they bear.
+
+        That is for machines on a base, whose parts are hard: what is soft bends within a part, and needs them all.
+        """
+        edges = self.graph.edges
         while len(parts.R) > 1:
-            beside = touching(parts.label, self.graph.edges, len(parts.R))
+            beside = touching(parts.label, edges, len(parts.R))
             label = without_weakest(parts.label, self.costs(parts, beside[parts.label], each), beside, parts.rests)
             if label is None:
                 break
             parts = replace(parts, label=label).compact()
-        return parts
+        beside = touching(parts.label, edges, len(parts.R))
+        cost = self.costs(parts, beside[parts.label], each)
+        return replace(parts, label=follow_bearings(parts.label, cost, parts.R, parts.rests, self.graph)).compact()
 
     def follow(
         self, parts: RigidParts, reference: int, scales: Sequence[float], each: Callable[..., list]
