@@ -32,7 +32,6 @@ _UNSEEN = 0.05  # least weight of a sample that no point supports
 _RESTING_FRAMES = 0.95  # a node may rest if points suit it in so many of the frames,
 _RESTING_SUPPORT = 0.7  # and support it so well, relative to how it was followed
 _RESTING_SHARE = 0.05  # least share of the nodes that rest side by side
-_RINGS = 2  # a node may belong to the parts of nodes so many edges away
 _LOOKED_AT = 10  # frames that say which part a node follows
 _FIRST = (0.8, 0.6, 0.5, 0.4, 0.4, 0.3)  # node spacings
 _AGAIN = (0.5, 0.4, 0.3)
@@ -72,6 +71,7 @@ class PartTracker:
         for scales in (_FIRST, _AGAIN)[: s.part_rounds]:
             parts = self.follow(parts, reference, scales, each)
             for _ in range(2):
+                # a node may belong to the parts of nodes two edges away
                 allowed = (self.near @ (self.near @ np.eye(len(parts.R))[parts.label])) > 0
                 chosen = choose_parts(parts.label, self.costs(parts, allowed, each), parts.rests, self.mean)
                 parts = replace(parts, label=chosen).compact()
