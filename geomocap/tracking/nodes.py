@@ -70,10 +70,12 @@ class NodeTracks:
     def motion_paths(self) -> MotionPaths:
         """Return the nodes as motion paths, those that are never seen left out.
 
-        Without their rotations: how a node's neighbours turn about it is steadier than how it turns itself.
+        Without their rotations: how a node's neighbours turn about it is steadier than how it turns itself. Motion is
+        counted from frame 0: from the reference frame, which is one in the middle, what turns on and on would turn by
+        half as much.
         """
         seen = np.isfinite(self.positions[..., 0]).any(axis=1)
-        return MotionPaths(self.positions[seen], sigma=self.sigma[seen], reference=self.reference[seen])
+        return MotionPaths(self.positions[seen], sigma=self.sigma[seen])
 
 
 class NodeModel:

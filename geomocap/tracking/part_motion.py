@@ -44,6 +44,27 @@ class RigidParts:
 
 
 @njit(cache=True, nogil=True)
+def carry_samples(R, t, label, samples, normals, binding, weights):
+    """Samples (S, 3) and their normals (S, 3) as the parts of their nodes carry them, with the nodes' shares.
+
+    The parameters are those of `part_equations`, `normals` (S, 3) in the reference frame.
+    """
+    y, n = np.zeros_like(samples), np.zeros_like(samples)
+    for s in range(len(samples)):
+        for k in range(binding.shape[1]):
+            q, w = label[binding[s, k]], weights[s, k]
+            for i in range(3):
+                y[s, i] += w * t[q, i]
+                for j in range(3):
+                    y[s, i] += w * R[q, i, j] * samples[s, j]
+                    n[s, i] += w * R[q, i, j] * normals[s, j]
+        length = max(np.sqrt(n[s, 0] ** 2 + n[s, 1] ** 2 + n[s, 2] ** 2), 1e-12)
+        for i in range(3):
+            n[s, i] /= length
+    return y, n
+
+
+@njit(cache=True, nogil=True)
 def part_equations(R, t, middle, label, samples, binding, weights, A, b, nodes, hinges, hold):
     """Normal equations H (6B, 6B), right side (6B,) of the parts' steps: turn about the middle, and shift.
 
@@ -66,9 +87,9 @@ def part_equations(R, t, middle, label, samples, binding, weights, A, b, nodes, 
     H = np.zeros((6 * B, 6 * B))
     g = np.zeros(6 * B)
     K = binding.shape[1]
-    J = np.zeros((K, 3, 6))
+    J = np.zeros((max(K, 2), 3, 6))
     AJ = np.zeros((3, 6))
-    part = np.empty(K, np.int64)
+    part, share = np.empty(max(K, 2), np.int64), np.empty(max(K, 2))
     for s in range(len(samples) + 2 * len(hinges)):
         hinge = s >= len(samples)
         if hinge:
@@ -78,16 +99,21 @@ def part_equations(R, t, middle, label, samples, binding, weights, A, b, nodes, 
         else:
             e, side = 0, 0
             p = samples[s]
-            used = K
+            used = 0
+            for k in range(K):
+                q = label[binding[s, k]]
+                for h in range(used + 1):
+                    if h == used:
+                        part[h], share[h] = q, 0.0
+                        used += 1
+                    if part[h] == q:
+                        share[h] += weights[s, k]
+                        break
         e0, e1, e2 = 0.0, 0.0, 0.0
         for k in range(used):
             if hinge:
-                part[k] = label[hinges[e, k]]
-                w = 1.0 - 2.0 * k
-            else:
-                part[k] = label[binding[s, k]]
-                w = weights[s, k]
-            q = part[k]
+                part[k], share[k] = label[hinges[e, k]], 1.0 - 2.0 * k
+            q, w = part[k], share[k]
             y0 = R[q, 0, 0] * p[0] + R[q, 0, 1] * p[1] + R[q, 0, 2] * p[2] + t[q, 0]
             y1 = R[q, 1, 0] * p[0] + R[q, 1, 1] * p[1] + R[q, 1, 2] * p[2] + t[q, 1]
             y2 = R[q, 2, 0] * p[0] + R[q, 2, 1] * p[1] + R[q, 2, 2] * p[2] + t[q, 2]

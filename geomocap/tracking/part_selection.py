@@ -23,7 +23,9 @@ _SHARED_COST = 0.005  # but must cost no more at all where they would go to seve
 _ALIKE = 0.03  # parts whose costs differ by less suit a node alike
 _CONCAVE = 0.35  # turn of the normals towards each other across an edge that is a crease, as a sine
 _FLAT = 0.5  # a round solid is flat if it is so high, relative to its width
+_ROUND = 0.25  # how far the axis may be from its middle, relative to its radius
 _LEAST = 6  # nodes of such a solid
+_KNOWN = 0.1  # directions in which two parts' turns hold a point less, relative to the best known, hold it not at all
 
 
 def choose_parts(label: np.ndarray, cost: np.ndarray, rests: np.ndarray, mean: csr_matrix) -> np.ndarray:
@@ -91,7 +93,7 @@ def without_weakest(label: np.ndarray, cost: np.ndarray, beside: np.ndarray, res
 
 
 def follow_bearings(
-    label: np.ndarray, cost: np.ndarray, R: np.ndarray, rests: np.ndarray, graph: NodeGraph
+    label: np.ndarray, cost: np.ndarray, R: np.ndarray, t: np.ndarray, rests: np.ndarray, graph: NodeGraph
 ) -> np.ndarray:
     """Let flat round solids turn with what stands on them, as turntables and wheels do.
 
@@ -104,8 +106,8 @@ def follow_bearings(
     label : (N,) int
     cost : (N, B) float
         Of the parts that touch a node's own part.
-    R : (B, T, 3, 3) float
-        Rotations of the parts.
+    R, t : (B, T, 3, 3), (B, T, 3) float, metres
+        Motions of the parts.
     rests : (B,) bool
     graph : NodeGraph
 
@@ -136,12 +138,13 @@ def follow_bearings(
                 continue
             touched = np.zeros(N, bool)
             touched[i[on_top[j]]] = touched[j[on_top[i]]] = True
-            axis = _axis(R[mover] @ R[ground].swapaxes(1, 2))
+            axis = _axis(R[ground].swapaxes(1, 2) @ R[mover])
+            center = _common_point(R, t, ground, mover, graph.nodes[on_top].mean(axis=0))
             rows = np.flatnonzero(alike)
             piece = connected_components(solid[rows][:, rows], directed=False)[1]
             for k in np.unique(piece[touched[rows]]):
                 nodes = rows[piece == k]
-                if len(nodes) >= _LEAST and _height_to_width(graph.nodes[nodes], axis) < _FLAT:
+                if len(nodes) >= _LEAST and _is_flat_and_round(graph.nodes[nodes], center, axis):
                     label[nodes] = mover
     return label
 
@@ -160,9 +163,17 @@ def _axis(turns: np.ndarray) -> np.ndarray:
     return np.linalg.eigh(w.T @ w)[1][:, 2]
 
 
-def _height_to_width(points: np.ndarray, axis: np.ndarray) -> float:
-    """Extent of points (n, 3) along an axis through their middle, relative to their diameter about it."""
-    away = points - points.mean(axis=0)
-    height = away @ axis
-    radius = np.linalg.norm(away - height[:, None] * axis, axis=1).max()
-    return float(np.ptp(height) / max(2 * radius, 1e-12))
+def _common_point(R: np.ndarray, t: np.ndarray, first: int, second: int, near: np.ndarray) -> np.ndarray:
+    """Point (3,), metres, in the reference that both parts carry to the same places, as `near` as the motions allow."""
+    apart = (R[first] - R[second]).reshape(-1, 3)
+    miss = (apart.reshape(-1, 3, 3) @ near).ravel() + (t[first] - t[second]).ravel()
+    return near - np.linalg.lstsq(apart, miss, rcond=_KNOWN)[0]
+
+
+def _is_flat_and_round(points: np.ndarray, center: np.ndarray, axis: np.ndarray) -> bool:
+    """Whether points (n, 3) are wider than high about an axis through a point, and have it in their middle."""
+    height = (points - center) @ axis
+    away = points - center - height[:, None] * axis
+    radius = max(float(np.linalg.norm(away, axis=1).max()), 1e-12)
+    middle = 0.5 * (away.min(axis=0) + away.max(axis=0))
+    return bool(np.ptp(height) < _FLAT * 2 * radius and np.linalg.norm(middle) < _ROUND * radius)

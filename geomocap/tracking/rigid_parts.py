@@ -22,7 +22,7 @@ from geomocap.tracking.deformation import rotation_of
 from geomocap.tracking.node_graph import NodeGraph
 from geomocap.tracking.node_settings import NodeTrackingSettings
 from geomocap.tracking.part_grouping import MotionForms, group_nodes
-from geomocap.tracking.part_motion import RigidParts, part_equations, part_motions
+from geomocap.tracking.part_motion import RigidParts, carry_samples, part_equations, part_motions
 from geomocap.tracking.part_selection import choose_parts, follow_bearings, touching, without_weakest
 
 _FORM_SCALE = 0.6  # node spacings
@@ -35,6 +35,8 @@ _RESTING_SHARE = 0.05  # least share of the nodes that rest side by side
 _LOOKED_AT = 10  # frames that say which part a node follows
 _FIRST = (0.8, 0.6, 0.5, 0.4, 0.4, 0.3)  # node spacings
 _AGAIN = (0.5, 0.4, 0.3)
+_LAST_STEPS = 2  # of them, after the best start is known; those before look at
+_THINNED = 2  # one sample in so many
 _ASTRAY = 0.01  # a part leaves the motion it had in the frame before for one that misses less by so much
 _FORMS = ("R", "t", "form", "slope", "cost", "weight")
 
@@ -93,7 +95,9 @@ class PartTracker:
             parts = replace(parts, label=label).compact()
         beside = touching(parts.label, edges, len(parts.R))
         cost = self.costs(parts, beside[parts.label], each)
-        return replace(parts, label=follow_bearings(parts.label, cost, parts.R, parts.rests, self.graph)).compact()
+        return replace(
+            parts, label=follow_bearings(parts.label, cost, parts.R, parts.t, parts.rests, self.graph)
+        ).compact()
 
     def follow(
         self, parts: RigidParts, reference: int, scales: Sequence[float], each: Callable[..., list]
@@ -114,12 +118,12 @@ class PartTracker:
                 now, last = k - way, k - way * min(2, abs(k - reference))
                 expected = _expected(R[:, now], t[:, now], R[:, last], t[:, last], middles)
                 starts = [expected, (R[:, now], t[:, now]), (parts.R[:, k], parts.t[:, k])]
-                found = [self.register(k, parts, *start, scales) for start in starts]
+                found = [self.register(k, parts, *start, scales[:-_LAST_STEPS], _THINNED) for start in starts]
                 missed = np.stack([_mean_of(self.misses(k, *motion, sample, own), own, len(R)) for motion in found])
                 missed[-1] += _ASTRAY
                 best, rows = missed.argmin(axis=0), np.arange(len(R))
-                R[:, k] = np.stack([f[0] for f in found])[best, rows]
-                t[:, k] = np.stack([f[1] for f in found])[best, rows]
+                chosen_R, chosen_t = (np.stack([f[i] for f in found])[best, rows] for i in (0, 1))
+                R[:, k], t[:, k] = self.register(k, parts, chosen_R, chosen_t, scales[-_LAST_STEPS:])
 
         each(one_way, [1, -1])
         return replace(parts, R=R, t=t)
@@ -205,25 +209,31 @@ class PartTracker:
         return 1 - np.exp(-0.5 * np.minimum(distance / c, 3.0) ** 2)
 
     def register(
-        self, frame: int, parts: RigidParts, R: np.ndarray, t: np.ndarray, scales: Sequence[float]
+        self, frame: int, parts: RigidParts, R: np.ndarray, t: np.ndarray, scales: Sequence[float], every: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Fit the parts' motions to a frame, from R (B, 3, 3), t (B, 3) on; at borders, parts hold each other."""
-        g, s, target, label = self.graph, self.settings, self.targets[frame], parts.label
+        """Fit the parts' motions to a frame, from R (B, 3, 3), t (B, 3) on; at borders, parts hold each other.
+
+        Of the samples and the frame's points, one in `every` is used.
+        """
+        g, s, label = self.graph, self.settings, parts.label
+        target = replace(self.targets[frame], points=self.targets[frame].points.every(every))
+        samples, normals, features, binding, weights = (
+            a[::every] for a in (g.samples, g.normals, g.features, g.binding, g.weights)
+        )
         free = np.repeat(~parts.rests, 6)
-        hinges = g.edges[label[g.edges[:, 0]] != label[g.edges[:, 1]]]
-        lengths = np.linalg.norm(g.nodes[hinges[:, 0]] - g.nodes[hinges[:, 1]], axis=1)
-        firm = s.fine_stiffness * s.stiffness * len(g.samples) / len(g.nodes) / 4
+        apart = label[g.edges[:, 0]] != label[g.edges[:, 1]]
+        hinges = g.edges[apart]
+        firm = s.fine_stiffness * s.stiffness * len(samples) / len(g.nodes) / 4
         for scale in scales:
             c = max(scale * g.spacing, self.closest)
-            x = (R[label] @ g.nodes[..., None])[..., 0] + t[label]
-            y, normals = g.deform(x, R[label])
+            y, turned = carry_samples(R, t, label, samples, normals, binding, weights)
             tree = cKDTree(target.coordinates(c))
-            found = pull(target, tree, y, normals, g.features, c, _ALONG, s.feature_weight)
-            strain = g.strain(x, R[label])[label[g.edges[:, 0]] != label[g.edges[:, 1]]] if len(lengths) else lengths
-            hold = firm / (1 + (strain / s.give) ** 2) ** 2
+            found = pull(target, tree, y, turned, features, c, _ALONG, s.feature_weight)
+            x = (R[label] @ g.nodes[..., None])[..., 0] + t[label]
+            hold = firm / (1 + (g.strain(x, R[label])[apart] / s.give) ** 2) ** 2
             middle = _means(x, label, len(R))
             H, b = part_equations(
-                R, t, middle, label, g.samples, g.binding, g.weights, found.A, found.b, g.nodes, hinges, hold
+                R, t, middle, label, samples, binding, weights, found.A, found.b, g.nodes, hinges, hold
             )
             damping = 1e-3 * np.bincount(label, minlength=len(R))[:, None] * ([g.spacing**2] * 3 + [1.0] * 3)
             step = np.zeros((len(R), 6))

@@ -41,6 +41,10 @@ class PointSet:
         """Return the points at some indices."""
         return PointSet(self.positions[kept], self.normals[kept], self.features[kept], self.gradients[kept])
 
+    def every(self, step: int) -> PointSet:
+        """Return one point in `step`."""
+        return self.at(np.arange(0, len(self), step))
+
     def turned_like(self, surface: np.ndarray, normals: np.ndarray, scale: float) -> PointSet:
         """Turn normals to the side that a known surface near them has.
 

@@ -112,6 +112,10 @@ def test_a_disc_turns_with_what_stands_on_it_and_a_column_does_not(height, turns
     cost[solid == 1] = 0.2  # round: both suit it
     R = np.tile(np.eye(3), (2, 5, 1, 1))
     R[1] = Rotation.from_rotvec(np.outer(np.linspace(0, 1, 5), [0, 0, 1])).as_matrix()
-    label = follow_bearings((solid == 2).astype(int), cost, R, np.array([True, False]), graph)
+    rests, boxes = np.array([True, False]), (solid == 2).astype(int)
+    label = follow_bearings(boxes, cost, R, np.zeros((2, 5, 3)), rests, graph)
     np.testing.assert_array_equal(label[solid != 1], solid[solid != 1] // 2)
     assert (label[solid == 1] == int(turns)).mean() > 0.95
+    # about an axis at its rim, it is no bearing
+    rim = np.array([0.19, 0.0, 0.0])
+    np.testing.assert_array_equal(follow_bearings(boxes, cost, R, rim - R @ rim, rests, graph), boxes)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from geomocap.tracking.node_settings import NodeTrackingSettings
 from geomocap.tracking.nodes import track_nodes
 from geomocap.tracking.part_grouping import MotionForms, group_nodes, motion_of, twist_of
-from geomocap.tracking.part_motion import part_equations, part_motions
+from geomocap.tracking.part_motion import carry_samples, part_equations, part_motions
 
 FRAMES = 9
 SMALL = NodeTrackingSettings(nodes=180, coarse_nodes=60, points=1500, coarse_points=800)
@@ -109,6 +109,22 @@ def test_part_equations_are_those_of_the_energy():
     H, g = part_equations(R, t, middle, label, samples, binding, weights, A, b, nodes, hinges, hold)
     np.testing.assert_allclose(H, J.T @ J, atol=1e-6)
     np.testing.assert_allclose(g, -J.T @ r, atol=1e-6)
+
+
+def test_samples_are_carried_by_the_parts_of_their_nodes():
+    rng = np.random.default_rng(5)
+    B, N, S = 3, 12, 25
+    R, t = Rotation.from_rotvec(rng.normal(size=(B, 3))).as_matrix(), rng.normal(size=(B, 3))
+    label, binding, weights = np.arange(N) % B, rng.integers(0, N, (S, 4)), rng.random((S, 4))
+    weights /= weights.sum(axis=1, keepdims=True)
+    samples, normals = rng.normal(size=(2, S, 3))
+    y, n = carry_samples(R, t, label, samples, normals, binding, weights)
+    own = label[binding]
+    np.testing.assert_allclose(
+        y, np.einsum("sk,skij,sj->si", weights, R[own], samples) + np.einsum("sk,ski->si", weights, t[own])
+    )
+    turned = np.einsum("sk,skij,sj->si", weights, R[own], normals)
+    np.testing.assert_allclose(n, turned / np.linalg.norm(turned, axis=1, keepdims=True))
 
 
 def test_motions_of_parts():
