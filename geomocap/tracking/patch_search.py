@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from geomocap.tracking.companions import Companions
 from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.one_camera import align_alone
 from geomocap.tracking.patch_motion import carried, extrapolate, image_flow, lift_flow, nearest
@@ -45,6 +46,8 @@ class Followed:
         Why it was not measured, see `REASONS`.
     beside : (N,) int
         Frames in a row in which an older patch was nearer than patches are placed.
+    companions : Companions
+        Patches beside those that are lost, when these were measured last.
     by_one : bool
         Whether a single camera may follow a patch.
     """
@@ -56,6 +59,7 @@ class Followed:
     gap: np.ndarray
     reason: np.ndarray
     beside: np.ndarray
+    companions: Companions
     by_one: bool
 
     @classmethod
@@ -64,17 +68,25 @@ class Followed:
         N = len(patches)
         rest = np.zeros((N, 3))
         none = np.zeros(N, int)
-        return cls(patches, identity, rest, rest.copy(), none, none.copy(), none.copy(), by_one)
+        return cls(patches, identity, rest, rest.copy(), none, none.copy(), none.copy(), Companions.none(N), by_one)
 
     @property
     def last_reason(self) -> np.ndarray:
         """Why each patch isn't measured now, (N,) int; `LAST_FRAME` (0) where it is."""
         return np.where(self.gap > 0, self.reason, LAST_FRAME)
 
+    def remembering(self, good: np.ndarray) -> Followed:
+        """Return them with companions for those that were measured and are not in the next frame, `good` (N,)."""
+        measured = self.gap == 0
+        gone, there = np.flatnonzero(measured & ~good), np.flatnonzero(measured)
+        p = self.patches
+        return replace(self, companions=self.companions.met(gone, there, self.identity, p.positions, p.frames))
+
     def select(self, which: np.ndarray) -> Followed:
         """Return some of them, by a mask or by positions."""
         rows = ("identity", "velocity", "spin", "gap", "reason", "beside")
-        return replace(self, patches=self.patches.select(which), **{name: getattr(self, name)[which] for name in rows})
+        parts = {name: getattr(self, name)[which] for name in rows}
+        return replace(self, patches=self.patches.select(which), companions=self.companions.select(which), **parts)
 
     def join(self, other: Followed) -> Followed:
         """Return these followed by others, which take over the motion of their nearest neighbours."""
@@ -92,6 +104,7 @@ class Followed:
             np.concatenate([self.gap, other.gap]),
             np.concatenate([self.reason, other.reason]),
             np.concatenate([self.beside, other.beside]),
+            self.companions.join(other.companions),
             self.by_one,
         )
 
@@ -168,10 +181,10 @@ def judge(state: Followed, found: Alignment, view: FrameViews, settings: Trackin
 
 
 def carry_lost(state: Followed, found: Alignment, good: np.ndarray) -> Alignment:
-    """Put patches that were not measured where the most typical of their neighbours' motions takes them."""
-    lost, sure = np.flatnonzero(~good), np.flatnonzero(good)
-    positions, frames = found.positions.copy(), found.frames.copy()
+    """Put patches that were not measured where their companions have them; else where those nearest now go."""
     old = state.patches
+    positions, frames, known = state.companions.placed(state.identity, good, found.positions, found.frames)
+    lost, sure = np.flatnonzero(~known), np.flatnonzero(good)
     near = nearest(old.positions, lost, sure, 5)
     if near.shape[1]:
         places, turned = carried(old.positions, old.frames, near, found.positions, found.frames, lost)

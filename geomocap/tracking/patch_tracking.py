@@ -26,6 +26,7 @@ _SMOOTH = 0.7  # share of the newest motion in the velocity
 _DOUBLE = 0.5  # of the spacing: patches nearer than that follow the same surface
 _LONG_BESIDE = 4  # frames after which the younger one is given up
 _SAME_SIDE = 0.5  # cosine between normals
+_LOOK_EVERY = 3  # frames between looks for lost patches in all cameras
 
 
 def track_surface(
@@ -168,16 +169,28 @@ def _next(
     found = search(state, previous, view, settings)
     reason = judge(state, found, view, settings)
     good = reason == LAST_FRAME
+    state = state.remembering(good)
     found = carry_lost(state, doubted(state.patches, found), good)
-    old = state.patches
-    if frame % settings.seed_every == 0:
+    old, regained = state.patches, np.zeros(len(good), bool)
+    if frame % _LOOK_EVERY == 0:
         carried = old.moved(found.positions, found.frames)
         again, seen, cameras = reacquire(carried, ~good, view, hiding_depth(old, view, settings.slack_px), settings)
-        found, good = found.replaced(seen, again), good | seen
-        there = with_templates(old.moved(found.positions, found.frames), cameras, view, found.image_sigma)
+        again = found.replaced(seen, again)
+        places = again.positions, again.frames
+        tolerance = settings.neighbour_px * old.size
+        regained = state.companions.agreed(state.identity, good, seen, *places, tolerance)
+        found = found.replaced(regained, again)
+        there = old.moved(found.positions, found.frames)
+        there = with_templates(there, cameras & regained[:, None], view, found.image_sigma)
         old = there.moved(old.positions, old.frames)
     shift = found.positions - old.positions
     turn = Rotation.from_matrix(found.frames @ np.swapaxes(old.frames, 1, 2)).as_rotvec()
+    # where a patch was carried to is put right, which is no motion: that of the nearest measured one is
+    led, sure = np.flatnonzero(~good), np.flatnonzero(good)
+    if len(led) and len(sure):
+        leader = sure[cKDTree(found.positions[sure]).query(found.positions[led])[1]]
+        shift[led], turn[led] = shift[leader], turn[leader]
+    good |= regained
     gap = np.where(good, 0, state.gap + 1)
     moved = renewed(old.moved(found.positions, found.frames), found, good, view, settings.templates)
     moved = new_views(moved, found, good, view, settings.slack_px)
@@ -193,6 +206,7 @@ def _next(
         gap,
         reason,
         beside,
+        state.companions,
         state.by_one,
     )
     lost = (gap > settings.longest_gap) | (reason == DOUBLE)

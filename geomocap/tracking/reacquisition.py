@@ -11,8 +11,8 @@ from geomocap.tracking.patches import Alignment, Patches, align, facings, visibl
 from geomocap.tracking.tracking_settings import TrackingSettings
 
 _FACING = 0.35
-_SURE = 0.92  # correlation
-_FAR_PX = 5.0  # how far from where its neighbours took it a patch may be found
+_SURE = 0.9  # correlation
+_FAR_PX = 7.0  # how far from where its companions have it a patch may be found
 
 
 def reacquire(
@@ -27,7 +27,7 @@ def reacquire(
     Parameters
     ----------
     patches : Patches
-        Where their neighbours' motion has taken them.
+        Where their companions have them.
     lost : (N,) bool
     view : FrameViews
     slack : (N, 1) float, metres

@@ -1,0 +1,98 @@
+"""Lost patches kept in place by those that were measured beside them."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
+
+from geomocap.tracking.companions import Companions
+
+RNG = np.random.default_rng(0)
+LIMB, TRUNK = 30, 30
+N = LIMB + TRUNK
+POSITIONS = np.concatenate(
+    [RNG.uniform((0.0, 0, 0), (0.3, 0.05, 0.05), (LIMB, 3)), RNG.uniform((0.0, 0.08, 0), (0.3, 0.3, 0.1), (TRUNK, 3))]
+)
+FRAMES = Rotation.random(N, random_state=1).as_matrix()
+IDENTITY = RNG.permutation(1000)[:N]
+TURN, SHIFT = Rotation.from_rotvec((0.3, 1.2, -0.5)).as_matrix(), np.array([0.4, -0.2, 0.1])
+ON_LIMB = np.arange(N) < LIMB
+
+
+def moved_limb():
+    """Places after the limb alone has moved."""
+    positions, frames = POSITIONS.copy(), FRAMES.copy()
+    positions[:LIMB], frames[:LIMB] = POSITIONS[:LIMB] @ TURN.T + SHIFT, TURN @ FRAMES[:LIMB]
+    return positions, frames
+
+
+def remembered(who, among=None):
+    among = np.arange(N) if among is None else among
+    return Companions.none(N).met(who, among, IDENTITY, POSITIONS, FRAMES)
+
+
+def test_a_lost_patch_goes_with_most_of_its_companions():
+    truth, turned = moved_limb()
+    lost = np.array([3, 11, LIMB + 4])
+    known = np.ones(N, bool)
+    known[lost] = False
+    guess = truth.copy()
+    guess[lost] = 9.0
+    X, Q, placed = remembered(lost).placed(IDENTITY, known, guess, turned)
+    assert placed.all()
+    assert_allclose(X, truth, atol=1e-12)
+    assert_allclose(Q, turned, atol=1e-12)
+
+
+def test_three_found_again_bring_back_the_whole_limb():
+    truth, turned = moved_limb()
+    companions = remembered(np.arange(LIMB), np.arange(LIMB))
+    known = ~ON_LIMB
+    first = companions.identity[0][:3]  # companions of the same patch
+    known |= np.isin(IDENTITY, first)
+    guess = np.where(known[:, None], truth, 9.0)
+    X, _, placed = companions.placed(IDENTITY, known, guess, turned)
+    assert placed.all()
+    assert_allclose(X, truth, atol=1e-12)
+    two = known & (IDENTITY != first[0])
+    assert_array_equal(companions.placed(IDENTITY, two, guess, turned)[2], two)
+
+
+@pytest.mark.parametrize("sure", [True, False])
+def test_what_is_found_must_lie_among_its_companions(sure):
+    """Found patches agree with sure ones, or with one another; what is elsewhere agrees with none."""
+    truth, turned = moved_limb()
+    companions = remembered(np.arange(LIMB), np.arange(LIMB))
+    doubtful = ON_LIMB & (np.arange(N) % 3 > 0)
+    wrong = np.array([1, 10, 19])
+    at = truth.copy()
+    at[wrong] += 0.02
+    others = ~doubtful if sure else ~ON_LIMB
+    agreed = companions.agreed(IDENTITY, others, doubtful, at, turned, np.full(N, 0.005))
+    assert not agreed[wrong].any() and not agreed[~doubtful].any()
+    right = doubtful.copy()
+    right[wrong] = False
+    assert agreed[right].mean() > 0.9
+    scattered = at + RNG.normal(0, 0.05, at.shape)
+    assert not companions.agreed(IDENTITY, ~ON_LIMB, doubtful, scattered, turned, np.full(N, 0.005)).any()
+
+
+def test_companions_stay_with_their_patches():
+    truth, turned = moved_limb()
+    companions = remembered(np.arange(N))
+    half = np.flatnonzero(np.arange(N) % 2 == 0)
+    order = np.concatenate([half, np.setdiff1d(np.arange(N), half)])
+    joined = companions.select(half).join(companions.select(order[len(half) :]))
+    known = np.arange(N) % 5 > 0
+    X, _, placed = joined.placed(IDENTITY[order], known[order], truth[order], turned[order])
+    assert placed.all()
+    assert_allclose(X, companions.placed(IDENTITY, known, truth, turned)[0][order], atol=1e-9)
+
+
+def test_those_that_left_count_no_more():
+    companions = remembered(np.array([0]))
+    rest = np.setdiff1d(np.arange(N), np.flatnonzero(np.isin(IDENTITY, companions.identity[0][2:])))
+    known = np.ones(len(rest), bool)
+    known[0] = False
+    left = companions.select(rest).placed(IDENTITY[rest], known, POSITIONS[rest], FRAMES[rest])[2]
+    assert not left[0]
