@@ -27,6 +27,8 @@ _SOFT_EXCESS = np.deg2rad(12.0)  # what blends miss by more than this is no soft
 _LEAF_EXCESS = np.deg2rad(6.0)
 _SOFT_FLOOR = np.deg2rad(1.0)
 _QUANTILE = 0.95
+_REACH = 0.95  # share of a body's samples within the reach of its joints
+_SHIFT = 0.4  # a body may come apart from a joint by this, because of noise and softness (largest radii)
 _SMALL = 1.5  # times what other bodies need
 _HUB = 4  # so many neighbours: a trunk, whose turn may well be a small part of a limb's
 
@@ -78,14 +80,18 @@ class Candidate:
 
 
 def judge(body: int, model: BodyModel, evidence: Evidence, criterion: Criterion) -> Candidate:
-    """What speaks for a body: how far it turns against its neighbours, and how badly these explain it."""
+    """What speaks for a body: how far it turns against neighbours that hold it, and how badly neighbours explain it."""
     neighbours = np.flatnonzero(model.adjacent(evidence.adjacency)[body])
     members = np.flatnonzero(model.label == body)
     if not len(neighbours) or not len(members):
         return Candidate(body, np.inf, -1, np.inf, np.inf)
-    turns = [_turn(body, int(q), model, evidence) for q in neighbours]
-    turn, into = min(zip(turns, neighbours.tolist(), strict=True))
-    rest = evidence.rest[members]
+    rest, slack = evidence.rest[members], _SHIFT * criterion.largest_radius
+    motion = model.rotations[body], model.translations[body]
+    beside = [(model.rotations[q], model.translations[q]) for q in neighbours]
+    joined = np.array([may_be_joined(rest, motion, other, slack) for other in beside])
+    against = neighbours[joined] if joined.any() else neighbours
+    turns = [_turn(body, int(q), model, evidence) for q in against]
+    turn, into = min(zip(turns, against.tolist(), strict=True))
     radius = min(float(np.sqrt(((rest - rest.mean(axis=0)) ** 2).sum(axis=1).mean())), criterion.largest_radius)
     if len(members) > _MOST_SAMPLES:
         members = members[np.linspace(0, len(members) - 1, _MOST_SAMPLES).astype(int)]
@@ -109,6 +115,32 @@ def judge(body: int, model: BodyModel, evidence: Evidence, criterion: Criterion)
     turn = max(turn - float(np.arctan2(_FEIGNED * sigma, max(radius, 1e-9))), 0.0)
     by_turn, by_excess = turn / criterion.min_turn, excess / criterion.min_excess
     return Candidate(body, min(by_turn, by_excess), into if by_turn < by_excess else -1, turn, excess)
+
+
+def may_be_joined(
+    rest: np.ndarray, motion: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray], slack: float
+) -> bool:
+    """Whether a joint in its reach may hold a body to another one.
+
+    A joint that a body reaches shifts its middle by no more than the turn at that distance. A hand at a hip may well
+    turn like the thigh for a while, but it goes elsewhere.
+
+    Parameters
+    ----------
+    rest : (n, 3) float, metres
+        Samples of the body.
+    motion, other : pairs of (T, 3, 3) float and (T, 3) float, metres
+        Rotations and translations of the body and of the other one.
+    slack : float, metres
+        By which the body may come apart from the joint.
+    """
+    middle = rest.mean(axis=0)
+    reach = float(np.quantile(np.linalg.norm(rest - middle, axis=1), _REACH))
+    turned, moved = motion[0] - other[0], motion[1] - other[1]
+    shift = np.linalg.norm(turned @ middle + moved, axis=1)
+    # ‖R − Q‖ = √8 sin(a/2) for a turn by a between the two, which carries what is at distance r by 2 sin(a/2) r
+    allowed = np.linalg.norm(turned, axis=(1, 2)) / np.sqrt(2.0) * reach
+    return float(np.quantile(shift - allowed, _QUANTILE)) < slack
 
 
 def _turn(first: int, second: int, model: BodyModel, evidence: Evidence) -> float:

@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
-from geomocap.segmentation.body_criteria import fixed_share
+from geomocap.segmentation.body_criteria import fixed_share, may_be_joined
 from geomocap.segmentation.motion_bodies import MotionBodiesSettings, find_motion_bodies
 from geomocap.segmentation.motion_labels import label_points
 from geomocap.segmentation.motion_paths import MotionPaths
@@ -108,6 +108,21 @@ def test_fixed_share_of_a_turn():
     assert turn == pytest.approx(np.quantile(np.linalg.norm(turns, axis=1), 0.95))
     other = first * Rotation.from_rotvec(rng.normal(scale=0.4, size=(30, 3)))
     assert fixed_share(first.as_matrix(), other.as_matrix(), second.as_matrix())[1] > 0.3
+
+
+def test_what_turns_alike_elsewhere_is_not_joined(three):
+    rest = three.positions[three.body == 1, 0]
+
+    def motion(b):
+        return three.rotations[:, b], three.translations[:, b]
+
+    for b in (0, 1, 2):
+        assert may_be_joined(rest, motion(1), motion(b), 0.01)
+    R, t = motion(1)
+    hinge = np.array([0.4, 0.0, 0.3])  # the same turns about an axis beside
+    assert not may_be_joined(rest, (R, t), (R, hinge - R @ hinge), 0.01)
+    still = np.tile(np.eye(3), (len(R), 1, 1)), np.zeros_like(t)
+    assert not may_be_joined(rest, (still[0], t), still, 0.01)
 
 
 def test_alternatives_have_other_numbers_of_bodies_nearest_first(found):
