@@ -51,7 +51,7 @@ class NodeTrackingSettings(Settings):
         "that of a capture's volume always does",
     )
     part_misfit: float = Field(
-        0.1, gt=0, description="points may miss two pieces of a part by this much more than each alone (node spacings)"
+        0.07, gt=0, description="points may miss two pieces of a part by this much more than each alone (node spacings)"
     )
     part_share: float = Field(0.01, gt=0, lt=0.5, description="smallest rigid part (share of the nodes)")
     seed: int = Field(0, ge=0, description="seed of the thinning of points")

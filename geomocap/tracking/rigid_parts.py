@@ -26,7 +26,9 @@ from geomocap.tracking.part_motion import RigidParts, carry_samples, part_equati
 from geomocap.tracking.part_selection import choose_parts, follow_bearings, touching, without_weakest
 
 _FORM_SCALE = 0.6  # node spacings
-_MISFIT_SCALE = 0.3
+_MISFIT_SCALE = 0.3  # node spacings; points farther along the surface, or facing elsewhere, are others
+_ACROSS = 0.15  # distance from the points' planes that counts as a miss, node spacings
+_SPARSE = 4 / 3  # points are no farther apart than so many of the least scale
 _ALONG = 0.01  # weight of a distance along the surface relative to one across it
 _UNSEEN = 0.05  # least weight of a sample that no point supports
 _RESTING_FRAMES = 0.95  # a node may rest if points suit it in so many of the frames,
@@ -47,6 +49,8 @@ class PartTracker:
     def __init__(self, graph: NodeGraph, targets: Sequence[Target], closest: float, settings: NodeTrackingSettings):
         """Take the frames' points, their normals turned outwards; `closest` is the least scale, metres."""
         self.graph, self.targets, self.closest, self.settings = graph, targets, closest, settings
+        c = max(_MISFIT_SCALE * graph.spacing, closest)
+        self.trees = [cKDTree(np.hstack([p.points.positions, c * p.points.normals])) for p in targets]
         self.owner = graph.binding[np.arange(len(graph.samples)), graph.weights.argmax(axis=1)]
         N = len(graph.nodes)
         i, j = graph.edges.T
@@ -196,17 +200,24 @@ class PartTracker:
         return moves @ of_motion[label] @ moves.swapaxes(1, 2) + floor * np.eye(3)
 
     def misses(self, frame: int, R: np.ndarray, t: np.ndarray, sample: np.ndarray, part: np.ndarray) -> np.ndarray:
-        """How far samples (n,) are from a frame's points if carried by parts (n,), robustly, 0 to 1.
+        """How far samples (n,) are from a frame's surface if carried by parts (n,), robustly, 0 to 1.
 
-        R (B, 3, 3) and t (B, 3) are the parts' motions.
+        The surface is that of the nearest points' planes, as far as these points are near: where on a surface its
+        points lie is chance. R (B, 3, 3) and t (B, 3) are the parts' motions.
         """
         g, points = self.graph, self.targets[frame].points
         c = max(_MISFIT_SCALE * g.spacing, self.closest)
         y = (R[part] @ g.samples[sample][..., None])[..., 0] + t[part]
         n = (R[part] @ g.normals[sample][..., None])[..., 0]
-        tree = cKDTree(np.hstack([points.positions, c * points.normals]))
-        distance = tree.query(np.hstack([y, c * n]), distance_upper_bound=3 * c)[0]
-        return 1 - np.exp(-0.5 * np.minimum(distance / c, 3.0) ** 2)
+        found = self.trees[frame].query(np.hstack([y, c * n]), distance_upper_bound=3 * c)[1]
+        none = found == len(points)
+        found[none] = 0
+        off, facing = y - points.positions[found], points.normals[found]
+        across = (off * facing).sum(axis=1)
+        along = np.sqrt(np.maximum((off**2).sum(axis=1) - across**2, 0.0))
+        beyond = np.maximum(along - _SPARSE * self.closest, 0.0)
+        squared = (across / (_ACROSS * g.spacing)) ** 2 + (beyond / c) ** 2 + ((n - facing) ** 2).sum(axis=1)
+        return np.where(none, 1.0, 1 - np.exp(-0.5 * squared))
 
     def register(
         self, frame: int, parts: RigidParts, R: np.ndarray, t: np.ndarray, scales: Sequence[float], every: int = 1

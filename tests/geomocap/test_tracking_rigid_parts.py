@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from geomocap.tracking.correspondences import Target
+from geomocap.tracking.node_graph import NodeGraph
 from geomocap.tracking.node_settings import NodeTrackingSettings
 from geomocap.tracking.nodes import track_nodes
 from geomocap.tracking.part_grouping import MotionForms, group_nodes, motion_of, twist_of
 from geomocap.tracking.part_motion import carry_samples, part_equations, part_motions
+from geomocap.tracking.rigid_parts import PartTracker
+from geomocap.tracking.surface_points import PointSet
 
 FRAMES = 9
 SMALL = NodeTrackingSettings(nodes=180, coarse_nodes=60, points=1500, coarse_points=800)
@@ -125,6 +130,28 @@ def test_samples_are_carried_by_the_parts_of_their_nodes():
     )
     turned = np.einsum("sk,skij,sj->si", weights, R[own], normals)
     np.testing.assert_allclose(n, turned / np.linalg.norm(turned, axis=1, keepdims=True))
+
+
+def test_what_slides_in_its_plane_misses_nothing_and_what_leaves_it_does():
+    rng = np.random.default_rng(6)
+    u = np.linspace(-1, 1, 15)
+    nodes = np.stack([*np.meshgrid(u, u), np.zeros((15, 15))], axis=-1).reshape(-1, 3)
+    up, none, N = np.tile([0.0, 0.0, 1.0], (len(nodes), 1)), np.zeros((len(nodes), 0)), len(nodes)
+    edges = np.array(sorted(cKDTree(nodes).query_pairs(0.15)))
+    own, ones = np.arange(N)[:, None], np.ones((N, 1))
+    graph = NodeGraph(nodes, 1 / 7, edges, np.full(len(edges), 1 / 7), nodes, up, none, own, ones)
+    seen = np.column_stack([rng.uniform(-1.5, 1.5, (9000, 2)), np.zeros(9000)])
+    points = PointSet(seen, np.tile([0.0, 0.0, 1.0], (9000, 1)), np.zeros((9000, 0)), np.zeros((9000, 0, 3)))
+    tracker = PartTracker(graph, [Target(points, np.zeros(0))], 0.03, SMALL)
+
+    def missed(shift):
+        part, still = np.zeros(N, int), np.eye(3)[None]
+        return tracker.misses(0, still, np.array([shift], float), np.arange(N), part)
+
+    assert missed((0, 0, 0)).max() < 1e-3  # points are random: a few gaps are wider than usual
+    assert missed((0.3, 0.2, 0)).max() < 1e-3
+    assert (missed((0, 0, 0.04)) > 0.5).all()
+    assert missed((4, 0, 0)).min() == 1.0
 
 
 def test_motions_of_parts():
