@@ -153,7 +153,8 @@ def find_motion_bodies(
     """Find the rigid bodies that move the samples.
 
     Every sample's neighbourhood on the surface has a rotation since frame 0, whatever lever arms there are. Samples
-    that turn alike are grouped (average linkage along the surface), too finely. Each group gets a rigid motion, each
+    that turn alike are grouped (average linkage along the surface), too finely, unless the paths say which rigid parts
+    they are of. Each group gets a rigid motion, each
     sample follows one body or a blend of two, and then the weakest body goes, again and again, until each one left
     turns against its neighbours and is not explained by blends of them. At last, parts of soft skin go, which turn by a
     fixed share of what the bodies beside them do, and bodies of too few samples.
@@ -192,7 +193,8 @@ def find_motion_bodies(
     evidence = _evidence(positions, weights, paths, reference, certain, turns, graph, extent, settings)
     linkage = connected_linkage(turns, graph.neighbours)
     least = max(6, round(_EARLY_SHARE * settings.min_share * paths.count))
-    label = absorb_small(linkage.cut(np.deg2rad(settings.first_cut_deg)), turns, graph, least)
+    first = linkage.cut(np.deg2rad(settings.first_cut_deg)) if paths.parts is None else paths.parts
+    label = absorb_small(first, turns, graph, least)
     if settings.bodies > int(label.max()) + 1:
         label = linkage.cut_count(settings.bodies)
     model = reassign(model_of_labels(label, evidence), evidence, 4).compact()

@@ -28,12 +28,15 @@ class MotionPaths:
     reference : (N, 3) float, optional
         Positions of all samples at one time, metres, world. The motion is counted from there; without it, from frame 0
         (samples that are not seen there are carried back by their neighbours).
+    parts : (N,) int, optional
+        Rigid parts, from 0, that the samples are known to move with; bodies are joined of these.
     """
 
     positions: np.ndarray
     rotations: np.ndarray | None = None
     sigma: np.ndarray | None = None
     reference: np.ndarray | None = None
+    parts: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.positions.ndim != 3 or self.positions.shape[2] != 3:
@@ -45,6 +48,7 @@ class MotionPaths:
             "rotations": (self.rotations, [(count, frames, 3, 3)]),
             "sigma": (self.sigma, [(count,), (count, frames)]),
             "reference": (self.reference, [(count, 3)]),
+            "parts": (self.parts, [(count,)]),
         }
         for name, (array, shapes) in optional.items():
             if array is not None and array.shape not in shapes:

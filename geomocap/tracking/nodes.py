@@ -53,6 +53,8 @@ class NodeTracks:
         Positions in the reference frame, complete.
     edges : (E, 2) int
         Neighbours on the surface.
+    parts : (N,) int, optional
+        Rigid part of each node, if they were followed as parts.
     """
 
     positions: np.ndarray
@@ -61,6 +63,7 @@ class NodeTracks:
     reference_frame: int
     reference: np.ndarray
     edges: np.ndarray
+    parts: np.ndarray | None = None
 
     @property
     def sigma(self) -> np.ndarray:
@@ -75,7 +78,8 @@ class NodeTracks:
         half as much.
         """
         seen = np.isfinite(self.positions[..., 0]).any(axis=1)
-        return MotionPaths(self.positions[seen], sigma=self.sigma[seen])
+        parts = None if self.parts is None else np.unique(self.parts[seen], return_inverse=True)[1]
+        return MotionPaths(self.positions[seen], sigma=self.sigma[seen], parts=parts)
 
 
 class NodeModel:
@@ -226,11 +230,13 @@ def track_nodes(
 
     fine = list(map_items(refine, list(range(n_frames)), executor, "nodes", progress))
     x, R, covariance, lost = (np.stack([f[k] for f in fine], axis=1) for k in range(4))
+    parts = None
     if settings.part_rounds and not len(known):
         targets = [Target(frame, scales, settings.normal_weight) for frame in frames]
-        parts, covariance = find_rigid_parts(
+        found, covariance = find_rigid_parts(
             model.graph, targets, x, R, reference, 1.5 * model.spacing, settings, executor
         )
-        x, R = parts.carry(model.graph.nodes)
+        x, R = found.carry(model.graph.nodes)
+        parts = found.label
     x[lost] = np.nan
-    return NodeTracks(x, R, covariance, reference, model.graph.nodes, model.graph.edges)
+    return NodeTracks(x, R, covariance, reference, model.graph.nodes, model.graph.edges, parts)

@@ -51,6 +51,15 @@ def test_result_is_the_same_bit_for_bit(three, found):
     np.testing.assert_array_equal(again.rotations, found.rotations)
 
 
+def test_bodies_are_joined_of_known_parts(three):
+    halves = 2 * three.body + (np.arange(len(three.body)) % 2)
+    found = find_motion_bodies(MotionPaths(three.positions, parts=halves))
+    assert found.body_count == 3
+    assert same_partition(found.label, three.body) > 0.97
+    together = find_motion_bodies(MotionPaths(three.positions, parts=(three.body > 0).astype(int)))
+    assert together.body_count <= 2
+
+
 def test_number_of_bodies_can_be_given(three):
     for wanted in (2, 4):
         assert (
