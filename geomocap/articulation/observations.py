@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomocap.errors import GeometryError
+from geomocap.segmentation.motion_paths import DEPTH_SHARE
 
 INFLUENCES = 4  # bodies that may move a point, at most
 LEAST_SHARE = 0.01
@@ -72,7 +73,7 @@ class Observations:
     isotropic : (M,) float, 1 / metres²
         Weight of the distance from the target in all directions.
     across : (M,) float, 1 / metres²
-        Weight of the distance along the normal, in addition.
+        Weight of the distance along the normal, in addition; negative where that is known worse.
     """
 
     start: np.ndarray
@@ -93,7 +94,9 @@ class Observations:
         return np.repeat(np.arange(self.frames), np.diff(self.start))
 
     @classmethod
-    def of_paths(cls, positions: np.ndarray, sigma: np.ndarray, first_point: int = 0) -> Observations:
+    def of_paths(
+        cls, positions: np.ndarray, sigma: np.ndarray, first_point: int = 0, sight: np.ndarray | None = None
+    ) -> Observations:
         """Sightings of points along their paths.
 
         Parameters
@@ -103,14 +106,18 @@ class Observations:
         sigma : (N, T) float, metres
         first_point : int
             Number of the first path's point.
+        sight : (N, T, 3) float, optional
+            Directions along which positions are unsure, see `MotionPaths`.
         """
         frame, point = np.nonzero(np.isfinite(positions[:, :, 0]).T)
         start = np.searchsorted(frame, np.arange(positions.shape[1] + 1))
         target = positions[point, frame]
-        up = np.broadcast_to([0.0, 0.0, 1.0], target.shape)
         weight = 1.0 / sigma[point, frame] ** 2
         numbers = (point + first_point).astype(np.int32)
-        return cls(start, numbers, target, up, weight, np.zeros(len(weight)))
+        if sight is None:
+            up = np.broadcast_to([0.0, 0.0, 1.0], target.shape)
+            return cls(start, numbers, target, up, weight, np.zeros(len(weight)))
+        return cls(start, numbers, target, sight[point, frame], weight, (DEPTH_SHARE**2 - 1.0) * weight)
 
     @classmethod
     def of_frames(cls, frames: Sequence[tuple[np.ndarray, ...]]) -> Observations:

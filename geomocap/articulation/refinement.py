@@ -22,7 +22,7 @@ from geomocap.articulation.observations import Observations, SkinPoints
 from geomocap.articulation.skinning import candidates_near, fit_shares
 from geomocap.articulation.smoothness import Smoothness, typical_accelerations
 from geomocap.segmentation.motion_bodies import MotionBodies
-from geomocap.segmentation.motion_paths import MotionPaths
+from geomocap.segmentation.motion_paths import DEPTH_SHARE, MotionPaths, sure_part, within_sight
 from geomocap.settings import Settings
 from geomocap.skeleton.motion import fit_offsets, forward_kinematics, local_rotations
 from geomocap.skeleton.motion_skeleton import MotionSkeleton, skeleton_of_motion
@@ -204,7 +204,9 @@ def refine_motion(
             trust = _trust(bodies, points, paths, settings.cutoff * sigma)
             pull = np.full(len(points), (settings.blend_sigma * extent) ** 2)
             near = candidates_near(linkage, points)
-            points = fit_shares(points, bodies, paths.positions, trust, near, pull)
+            carried = bodies.carry(points.rest, points.bodies, points.shares).swapaxes(0, 1)
+            seen = within_sight(paths.positions, carried, paths.sight)
+            points = fit_shares(points, bodies, seen, trust, near, pull)
         points = _settled(points, bodies, paths, settings.cutoff * sigma)
         sigma = _sample_sigma(bodies, points, paths, least)
         if k == settings.rounds - 1:
@@ -216,7 +218,7 @@ def refine_motion(
             linkage,
             motion,
             points,
-            Observations.of_paths(paths.positions, spread),
+            Observations.of_paths(paths.positions, spread, sight=paths.sight),
             smoothness=smoothness_of(linkage, motion, extent, settings),
             joint_prior=prior,
             looseness=looseness,
@@ -260,7 +262,7 @@ def smoothness_of(linkage: Linkage, motion: JointMotion, extent: float, settings
 def _misses(bodies: BodyMotion, points: SkinPoints, paths: MotionPaths) -> np.ndarray:
     """Distances of what was seen from where the bodies carry the points, (N, T), metres; NaN where not seen."""
     carried = bodies.carry(points.rest, points.bodies, points.shares).swapaxes(0, 1)
-    return np.linalg.norm(carried - paths.positions, axis=2)
+    return np.linalg.norm(sure_part(carried - paths.positions, paths.sight), axis=2)
 
 
 def _trust(bodies: BodyMotion, points: SkinPoints, paths: MotionPaths, cutoff: np.ndarray) -> np.ndarray:
@@ -283,10 +285,15 @@ def _settled(points: SkinPoints, bodies: BodyMotion, paths: MotionPaths, cutoff:
         matrix += points.shares[:, k, None, None] * bodies.rotations[:, points.bodies[:, k]]
         offset += points.shares[:, k, None] * bodies.translations[:, points.bodies[:, k]]
     target = np.where(paths.seen[..., None], paths.positions, 0.0).swapaxes(0, 1) - offset
+    counted = matrix
+    if paths.sight is not None:
+        sight = paths.sight.swapaxes(0, 1)
+        along = (1.0 - DEPTH_SHARE**2) * (sight[:, :, None] @ matrix)
+        counted = matrix - sight[..., None] * along
     rest = points.rest
     for _ in range(_SETTLE_ROUNDS):
         trust = _trust(bodies, replace(points, rest=rest), paths, cutoff).T
-        turned = (trust[..., None, None] * matrix).swapaxes(2, 3)
+        turned = (trust[..., None, None] * counted).swapaxes(2, 3)
         normal = (turned @ matrix).sum(axis=0) + 1e-3 * np.eye(3)
         right = (turned @ target[..., None]).sum(axis=0)[..., 0] + 1e-3 * rest
         rest = np.linalg.solve(normal, right[..., None])[..., 0]

@@ -161,6 +161,7 @@ def trajectories_of(arrays: dict[str, np.ndarray], source: Path | str = "tracks.
         arrays.get("sigma", np.full((N, T), np.nan)),
         arrays.get("correlation", np.full((N, T), np.nan)),
         arrays.get("n_views", np.isfinite(positions[:, :, 0]).astype(int)),
+        arrays.get("sight", np.zeros((N, T, 3))),
         arrays.get("normals", np.zeros((N, 3))),
         arrays.get("placed", nothing),
         arrays.get("end_reason", np.full(N, LAST_FRAME)),

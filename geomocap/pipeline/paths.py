@@ -58,8 +58,13 @@ def patch_paths(tracked: dict[str, np.ndarray]) -> MotionPaths | None:
     if not len(chosen):
         return None
     sigma = tracked["sigma"][chosen]
+    sight = tracked["sight"][chosen].astype(float) if "sight" in tracked else np.zeros(0)
     # standard deviations with the median where a sample was not seen
-    return MotionPaths(tracked["positions"][chosen], sigma=np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma)))
+    return MotionPaths(
+        tracked["positions"][chosen],
+        sigma=np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma)),
+        sight=sight if sight.any() else None,
+    )
 
 
 def _covers(paths: MotionPaths) -> bool:

@@ -60,6 +60,7 @@ def _track(job: Job, capture: Capture) -> int:
         sigma=kept.sigma,
         correlation=kept.correlation,
         n_views=kept.n_views,
+        sight=kept.sight.astype(np.float32),
         velocity_std=motion.velocity_std,
         acceleration_std=motion.acceleration_std,
         normals=kept.normals,

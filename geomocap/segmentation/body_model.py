@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from geomocap.segmentation.motion_paths import DEPTH_SHARE, within_sight
 from geomocap.segmentation.rigid_motions import fit_rigid_motion
 from geomocap.segmentation.skin_blending import Blends, explain
 
@@ -29,10 +30,14 @@ class Evidence:
     seen : (N, T) bool
     sigma : (N,) float, metres
         Standard deviation of the positions as their source states it; 0: not stated.
+    sight : (N, T, 3) float, optional
+        Directions along which positions are unsure, see `MotionPaths`.
     rest : (N, 3) float, metres
         Positions in the reference.
+    tied : (N,) bool
+        Samples that were seen in the reference.
     certain : (N,) bool
-        Samples that were seen in the reference; the place of others is found by their body.
+        Those among them whose place there is sure; the place of others is found by their body.
     turns : (N, N) float32, radians
         How differently two samples turn.
     adjacency : (N, N) csr_matrix
@@ -53,7 +58,9 @@ class Evidence:
     weights: np.ndarray
     seen: np.ndarray
     sigma: np.ndarray
+    sight: np.ndarray | None
     rest: np.ndarray
+    tied: np.ndarray
     certain: np.ndarray
     turns: np.ndarray
     adjacency: csr_matrix
@@ -70,6 +77,7 @@ class Evidence:
         return explain(
             self.positions[samples],
             self.weights[samples],
+            None if self.sight is None else self.sight[samples],
             self.rest[samples],
             self.certain[samples],
             model.rotations,
@@ -178,14 +186,16 @@ def refit(model: BodyModel, evidence: Evidence, bodies: np.ndarray) -> BodyModel
             carried = carry(rotations[q], translations[q], rest[of])
             seen[of] = (seen[of] - (1.0 - w) * carried) / w
         weights = evidence.weights[members] * (part**2)[:, None]
-        rotations[b], translations[b], _ = fit_rigid_motion(seen, rest, weights, evidence.noise)
+        rotations[b], translations[b], _ = fit_rigid_motion(
+            seen, rest, weights, evidence.noise, sight=None if evidence.sight is None else evidence.sight[members]
+        )
     return replace(model, rotations=rotations, translations=translations)
 
 
 def settle_rest(model: BodyModel, evidence: Evidence) -> Evidence:
     """Find where samples that were not seen in the reference are there, by their body.
 
-    The place is the weighted mean over the frames of the positions carried back by the main body's motion.
+    The place is that which the main body's motion carries best to the positions of all frames, least squares.
     """
     open_places = np.flatnonzero(~evidence.certain)
     if not len(open_places):
@@ -193,9 +203,17 @@ def settle_rest(model: BodyModel, evidence: Evidence) -> Evidence:
     rest = evidence.rest.copy()
     for b in np.unique(model.label[open_places]):
         some = open_places[model.label[open_places] == b]
-        back = (evidence.positions[some] - model.translations[b])[:, :, None, :] @ model.rotations[b]
+        away = evidence.positions[some] - model.translations[b]
         share = evidence.weights[some] / np.maximum(evidence.weights[some].sum(axis=1, keepdims=True), 1e-12)
-        rest[some] = (share[:, :, None] * back[:, :, 0]).sum(axis=1)
+        if evidence.sight is None:
+            rest[some] = (share[:, :, None] * (away[:, :, None] @ model.rotations[b])[:, :, 0]).sum(axis=1)
+            continue
+        sight = evidence.sight[some]
+        away = within_sight(away, np.zeros(3), sight)
+        ray = (sight[:, :, None] @ model.rotations[b])[:, :, 0]
+        normal = np.eye(3) - (1.0 - DEPTH_SHARE**2) * np.einsum("nt,nti,ntj->nij", share, ray, ray)
+        right = (share[:, :, None] * (away[:, :, None] @ model.rotations[b])[:, :, 0]).sum(axis=1)
+        rest[some] = np.linalg.solve(normal, right[..., None])[..., 0]
     return replace(evidence, rest=rest)
 
 

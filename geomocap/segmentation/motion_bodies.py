@@ -15,7 +15,7 @@ from geomocap.segmentation.body_elimination import EliminationStep, eliminate
 from geomocap.segmentation.body_model import BodyModel, Evidence, carry, model_of_labels, reassign, refit, settle_rest
 from geomocap.segmentation.connected_linkage import Linkage, connected_linkage
 from geomocap.segmentation.local_rotations import local_rotations, turn_distances
-from geomocap.segmentation.motion_paths import MotionPaths
+from geomocap.segmentation.motion_paths import MotionPaths, sure_part
 from geomocap.segmentation.surface_graph import SurfaceGraph, surface_graph
 from geomocap.segmentation.track_completion import complete_tracks
 from geomocap.settings import Settings
@@ -189,8 +189,7 @@ def find_motion_bodies(
     turns = turn_distances(_known_rotations(paths, rotations), certainty > _CERTAIN)
     progress(_STAGE, 2, 4)
     # Too many bodies
-    certain = np.full(paths.count, True) if paths.reference is not None else paths.seen[:, 0]
-    evidence = _evidence(positions, weights, paths, reference, certain, turns, graph, extent, settings)
+    evidence = _evidence(positions, weights, paths, reference, turns, graph, extent, settings)
     linkage = connected_linkage(turns, graph.neighbours)
     least = max(6, round(_EARLY_SHARE * settings.min_share * paths.count))
     first = linkage.cut(np.deg2rad(settings.first_cut_deg)) if paths.parts is None else paths.parts
@@ -224,20 +223,23 @@ def _evidence(
     weights: np.ndarray,
     paths: MotionPaths,
     rest: np.ndarray,
-    certain: np.ndarray,
     turns: np.ndarray,
     graph: SurfaceGraph,
     extent: float,
     settings: MotionBodiesSettings,
 ) -> Evidence:
     near = csr_matrix(np.isfinite(graph.geodesics(max(settings.reach * extent, 3.0 * graph.spacing))).astype(float))
+    tied = np.full(paths.count, True) if paths.reference is not None else paths.seen[:, 0]
+    sure = paths.reference is not None or paths.sight is None or ~paths.sight[:, 0].any(axis=1)
     return Evidence(
         positions,
         weights,
         paths.seen,
         paths.typical_sigma(),
+        paths.sight,
         rest,
-        certain,
+        tied,
+        tied & sure,
         turns,
         graph.adjacency,
         near,
@@ -281,7 +283,7 @@ def _result(
         some = np.flatnonzero(memberships[:, b] > 0)
         moved = carry(model.rotations[b], model.translations[b], evidence.rest[some])
         carried[some] += memberships[some, b][:, None, None] * moved
-    miss = np.linalg.norm(carried - evidence.positions, axis=2)
+    miss = np.linalg.norm(sure_part(carried - evidence.positions, evidence.sight), axis=2)
     total = np.maximum(evidence.weights.sum(axis=1), 1e-12)
     residuals = np.sqrt((evidence.weights * miss**2).sum(axis=1) / total)
     follows = paths.seen & (miss < max(4.0 * float(np.median(residuals)), 0.005 * extent))

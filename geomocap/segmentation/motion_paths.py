@@ -9,6 +9,7 @@ import numpy as np
 from geomocap.errors import GeometryError
 
 _LEAST_FRAMES = 2
+DEPTH_SHARE = 0.1  # of what is missed along a line of sight, counts
 _GIVE = 0.001  # extents; what surfaces give although they belong to a rigid body
 
 
@@ -25,6 +26,9 @@ class MotionPaths:
         same: without a common reference for all of them, leave them out.
     sigma : (N,) or (N, T) float, optional
         Standard deviation of the positions, metres.
+    sight : (N, T, 3) float, optional
+        Unit vectors along which positions are unsure, as of those that a single camera sees: what is missed along them
+        counts a tenth. 0: sure in all directions.
     reference : (N, 3) float, optional
         Positions of all samples at one time, metres, world. The motion is counted from there; without it, from frame 0
         (samples that are not seen there are carried back by their neighbours).
@@ -35,6 +39,7 @@ class MotionPaths:
     positions: np.ndarray
     rotations: np.ndarray | None = None
     sigma: np.ndarray | None = None
+    sight: np.ndarray | None = None
     reference: np.ndarray | None = None
     parts: np.ndarray | None = None
 
@@ -47,6 +52,7 @@ class MotionPaths:
         optional = {
             "rotations": (self.rotations, [(count, frames, 3, 3)]),
             "sigma": (self.sigma, [(count,), (count, frames)]),
+            "sight": (self.sight, [(count, frames, 3)]),
             "reference": (self.reference, [(count, 3)]),
             "parts": (self.parts, [(count,)]),
         }
@@ -99,3 +105,22 @@ class MotionPaths:
         middle = float(np.median(sigma[known])) if known.any() else 1.0
         variance = np.where(known, sigma, middle) ** 2 + give
         return np.where(known, np.minimum((middle**2 + give) / variance, 4.0), self.seen * 0.25)
+
+
+def sure_part(misses: np.ndarray, sight: np.ndarray | None) -> np.ndarray:
+    """What of misses (…, 3) counts: all of it across the lines of sight (…, 3), a tenth along them."""
+    if sight is None:
+        return misses
+    return misses - (1.0 - DEPTH_SHARE) * (misses * sight).sum(axis=-1, keepdims=True) * sight
+
+
+def within_sight(positions: np.ndarray, carried: np.ndarray, sight: np.ndarray | None) -> np.ndarray:
+    """Positions (…, 3) moved along their lines of sight nearly to where a motion carries them.
+
+    To fit a motion to these, all directions counting the same, lowers the sum of squares of the sure parts of the
+    misses: it majorises that sum, and touches it at the motion so far (Hunter, Lange, A Tutorial on MM Algorithms,
+    2004).
+    """
+    if sight is None:
+        return positions
+    return positions - (1.0 - DEPTH_SHARE**2) * ((positions - carried) * sight).sum(axis=-1, keepdims=True) * sight

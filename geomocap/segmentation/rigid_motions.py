@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from geomocap.segmentation.motion_paths import DEPTH_SHARE, sure_part
 from geomocap.segmentation.rotations import nearest_rotation
 
 _ROUNDS = 5
+_DAMPING = 1e-9
+_START_ROUNDS = 3  # with all directions alike, before lines of sight are told apart
 
 
 def fit_rigid_motion(
-    positions: np.ndarray, rest: np.ndarray, weights: np.ndarray, least_scale: float, rounds: int = _ROUNDS
+    positions: np.ndarray,
+    rest: np.ndarray,
+    weights: np.ndarray,
+    least_scale: float,
+    rounds: int = _ROUNDS,
+    sight: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rigid motion of one group of samples, by weighted Kabsch with weights that fall with the residual.
 
@@ -28,6 +37,8 @@ def fit_rigid_motion(
         Residuals below this are all the same.
     rounds : int
         Times that the weights are found anew.
+    sight : (n, T, 3) float, optional
+        See `MotionPaths`.
 
     Returns
     -------
@@ -41,11 +52,13 @@ def fit_rigid_motion(
     given = np.maximum(weights, 1e-9)
     robust = given
     total = given.sum(axis=1)
-    for _ in range(rounds):
-        rotations, translations = _kabsch(positions, rest, robust)
-        miss = np.linalg.norm(
-            rest @ rotations.transpose(0, 2, 1) + translations[:, None] - positions.swapaxes(0, 1), axis=2
-        ).T
+    for k in range(rounds if sight is None else _START_ROUNDS + rounds):
+        if sight is None or k < _START_ROUNDS:
+            rotations, translations = _kabsch(positions, rest, robust)
+        else:
+            rotations, translations = _step(rotations, translations, positions, rest, robust, sight)
+        carried = (rest @ rotations.transpose(0, 2, 1) + translations[:, None]).swapaxes(0, 1)
+        miss = np.linalg.norm(sure_part(carried - positions, sight), axis=2)
         residuals = np.sqrt((given * miss**2).sum(axis=1) / total)
         scale = 2.0 * max(float(np.median(residuals)), least_scale)
         by_sample = 1.0 / (1.0 + (residuals / scale) ** 4)
@@ -63,6 +76,44 @@ def _kabsch(positions: np.ndarray, rest: np.ndarray, weights: np.ndarray) -> tup
     moments = (moving * share[..., None]).transpose(0, 2, 1) @ rest - center[:, :, None] * start[:, None, :]
     rotations = nearest_rotation(moments + 1e-12 * np.eye(3))
     return rotations, center - (rotations @ start[..., None])[..., 0]
+
+
+def _step(
+    rotations: np.ndarray,
+    translations: np.ndarray,
+    positions: np.ndarray,
+    rest: np.ndarray,
+    weights: np.ndarray,
+    sight: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """One Gauss-Newton step of the motion, in which misses along the lines of sight count little."""
+    turned = rest @ rotations.transpose(0, 2, 1)  # (T, n, 3), without the shift
+    misses = positions.swapaxes(0, 1) - turned - translations[:, None]
+    weights, sight = weights.T, sight.swapaxes(0, 1)
+    middle = (turned * weights[..., None]).sum(axis=1) / weights.sum(axis=1)[:, None]
+    arm = turned - middle[:, None]
+    zero = np.zeros(arm.shape[:2])
+    x, y, z = np.moveaxis(arm, 2, 0)
+    one = np.ones_like(zero)
+    # by the turn about the middle, and by the shift
+    jacobian = np.stack(
+        [
+            np.stack([zero, z, -y, one, zero, zero], -1),
+            np.stack([-z, zero, x, zero, one, zero], -1),
+            np.stack([y, -x, zero, zero, zero, one], -1),
+        ],
+        -2,
+    )
+    along = np.einsum("tni,tnij->tnj", sight, jacobian)
+    part = 1.0 - DEPTH_SHARE**2
+    normal = np.einsum("tn,tnij,tnik->tjk", weights, jacobian, jacobian)
+    normal -= part * np.einsum("tn,tnj,tnk->tjk", weights, along, along)
+    right = np.einsum("tn,tnij,tni->tj", weights, jacobian, misses)
+    right -= part * np.einsum("tn,tnj,tn->tj", weights, along, (sight * misses).sum(axis=2))
+    size = np.einsum("tii->t", normal)[:, None, None]
+    step = np.linalg.solve(normal + _DAMPING * size * np.eye(6), right[..., None])[..., 0]
+    turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
+    return turn @ rotations, translations + step[:, 3:] + middle - (turn @ middle[..., None])[..., 0]
 
 
 def turn_angles(rotations: np.ndarray) -> np.ndarray:

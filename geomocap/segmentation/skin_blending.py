@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
+from geomocap.segmentation.motion_paths import DEPTH_SHARE
+
 _BIG = 1e30
 
 
@@ -30,10 +32,42 @@ class Blends:
 
 
 @numba.njit(cache=True, nogil=True)
+def _place_at_rest(positions, weights, total, sight, rotations, translations, place):
+    """Place of a sample at rest by one body's motion, least squares over the frames; weights sum to `total`."""
+    place[:] = 0.0
+    normal = np.zeros((3, 3))
+    away = np.empty(3)
+    ray = np.empty(3)
+    for t in range(len(weights)):
+        w = weights[t] / total
+        for c in range(3):
+            away[c] = positions[t, c] - translations[t, c]
+        if len(sight):
+            along = 0.0
+            for c in range(3):
+                along += (1.0 - DEPTH_SHARE**2) * away[c] * sight[t, c]
+            for c in range(3):
+                away[c] -= along * sight[t, c]
+                ray[c] = 0.0
+                for d in range(3):
+                    ray[c] += rotations[t, d, c] * sight[t, d]
+            for c in range(3):
+                normal[c, c] += w
+                for d in range(3):
+                    normal[c, d] -= w * (1.0 - DEPTH_SHARE**2) * ray[c] * ray[d]
+        for c in range(3):
+            for d in range(3):
+                place[d] += w * rotations[t, c, d] * away[c]
+    if len(sight):
+        place[:] = np.linalg.solve(normal, place)
+
+
+@numba.njit(cache=True, nogil=True)
 def _explain_one(
     i,
     positions,
     weights,
+    sight,
     rest,
     certain,
     rotations,
@@ -49,6 +83,7 @@ def _explain_one(
     """Fill row i of the results of `_explain`."""
     frames = weights.shape[1]
     bodies = len(rotations)
+    sighted = sight.shape[1] > 0
     total = 1e-12
     for t in range(frames):
         total += weights[i, t]
@@ -61,13 +96,7 @@ def _explain_one(
             for c in range(3):
                 place[c] = rest[i, c]
         else:
-            for c in range(3):
-                place[c] = 0.0
-            for t in range(frames):
-                for c in range(3):
-                    away = weights[i, t] / total * (positions[i, t, c] - translations[b, t, c])
-                    for d in range(3):
-                        place[d] += rotations[b, t, c, d] * away
+            _place_at_rest(positions[i], weights[i], total, sight[i], rotations[b], translations[b], place)
         cost = 0.0
         for t in range(frames):
             square = 0.0
@@ -76,6 +105,13 @@ def _explain_one(
                 for d in range(3):
                     carried += rotations[b, t, c, d] * place[d]
                 miss[b, t, c] = positions[i, t, c] - carried
+            if sighted:
+                along = 0.0
+                for c in range(3):
+                    along += miss[b, t, c] * sight[i, t, c]
+                for c in range(3):
+                    miss[b, t, c] -= (1.0 - DEPTH_SHARE) * along * sight[i, t, c]
+            for c in range(3):
                 square += miss[b, t, c] ** 2
             cost += weights[i, t] * min(square, cap)
         costs[i, b] = cost / total
@@ -117,6 +153,7 @@ def _explain_one(
 def _explain(
     positions: np.ndarray,
     weights: np.ndarray,
+    sight: np.ndarray,
     rest: np.ndarray,
     certain: np.ndarray,
     rotations: np.ndarray,
@@ -136,6 +173,7 @@ def _explain(
             np.int64(i),
             positions,
             weights,
+            sight,
             rest,
             certain,
             rotations,
@@ -154,6 +192,7 @@ def _explain(
 def explain(
     positions: np.ndarray,
     weights: np.ndarray,
+    sight: np.ndarray | None,
     rest: np.ndarray,
     certain: np.ndarray,
     rotations: np.ndarray,
@@ -170,6 +209,8 @@ def explain(
     Parameters
     ----------
     positions, weights : (N, T, 3) float, metres; (N, T) float
+    sight : (N, T, 3) float, optional
+        Directions along which positions are unsure, see `MotionPaths`.
     rest : (N, 3) float, metres
     certain : (N,) bool
         Where `rest` is known; elsewhere each body may put the sample where it fits best.
@@ -187,6 +228,7 @@ def explain(
         *_explain(
             np.ascontiguousarray(positions),
             weights,
+            np.zeros((len(weights), 0, 3)) if sight is None else np.ascontiguousarray(sight, float),
             rest,
             certain,
             np.ascontiguousarray(rotations),

@@ -52,7 +52,7 @@ def join_broken(tracks: Trajectories) -> Trajectories:
         arrays["positions"][i, extra] = arrays["positions"][j, extra] + turn[extra] @ middle
         arrays["rotations"][i, extra] = turn[extra] @ between
         arrays["sigma"][i, extra] = np.hypot(arrays["sigma"][j, extra], spread / np.sqrt(3))
-        for name in ("correlation", "n_views"):
+        for name in ("correlation", "n_views", "sight"):
             arrays[name][i, extra] = arrays[name][j, extra]
         ends = np.flatnonzero(extra)
         if len(ends) and ends[-1] > np.flatnonzero(has)[-1]:

@@ -46,21 +46,20 @@ class _Shape:
     spread: np.ndarray
 
 
-def adjust_depths(tracks: Trajectories, rays: np.ndarray) -> Trajectories:
+def adjust_depths(tracks: Trajectories) -> Trajectories:
     """Move positions that a single camera measured along their lines of sight.
 
     Parameters
     ----------
     tracks : Trajectories
-    rays : (N, T, 3) float
-        Unit vectors from the only camera to the patch; 0 where several cameras see it or none.
 
     Returns
     -------
     Trajectories
         Their standard deviations stay: what is wrong with a depth in all frames alike is not seen.
     """
-    has, alone = tracks.measured, rays.any(axis=2)
+    has, rays = tracks.measured, tracks.sight
+    alone = rays.any(axis=2)
     if not alone.any():
         return tracks
     depth_std = float(np.sqrt(3) * np.median(tracks.sigma[alone]))

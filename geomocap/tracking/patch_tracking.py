@@ -110,7 +110,7 @@ def track_surface(
         if state is not None:
             record.ended(state.identity, state.last_reason, forward=False)
     found = record.trajectories(count)
-    return join_broken(adjust_depths(found, record.rays(count)) if by_one else found)
+    return join_broken(adjust_depths(found) if by_one else found)
 
 
 def _stream(

@@ -24,7 +24,7 @@ class _Measured:
     sigma: np.ndarray
     correlation: np.ndarray
     n_views: np.ndarray
-    rays: np.ndarray
+    sight: np.ndarray
 
 
 class TrackRecord:
@@ -50,7 +50,7 @@ class TrackRecord:
                 found.sigma[rows],
                 found.correlation[rows],
                 found.n_views[rows],
-                _rays(found.positions[rows], alone, centers),
+                _sight(found.positions[rows], alone, centers),
             )
         )
 
@@ -72,28 +72,21 @@ class TrackRecord:
         one = np.ones(len(patches))
         alone = np.where(views == 1, patches.has.argmax(axis=1), -1)
         blind = np.where(views == 1, np.sqrt((2 * _PLACED_PX**2 + DEPTH_PX**2) / 3), _PLACED_PX)
-        rays = _rays(patches.positions, alone, centers)
+        sight = _sight(patches.positions, alone, centers)
         self._measured.append(
-            _Measured(frame, identity, patches.positions, patches.frames, blind * patches.size, one, views, rays)
+            _Measured(frame, identity, patches.positions, patches.frames, blind * patches.size, one, views, sight)
         )
 
     def ended(self, identity: np.ndarray, reason: np.ndarray, forward: bool) -> None:
         """Keep why patches are followed no further."""
         self._ends.append((forward, identity, reason))
 
-    def rays(self, count: int) -> np.ndarray:
-        """Return unit vectors from the only camera to each patch; 0 where not just one saw it: (count, T, 3)."""
-        rays = np.zeros((count, self.n_frames, 3))
-        for m in self._measured:
-            rays[m.identity, m.frame] = m.rays
-        return rays
-
     def trajectories(self, count: int) -> Trajectories:
         """Return all `count` trajectories."""
         T = self.n_frames
         positions, rotations = np.full((count, T, 3), np.nan), np.full((count, T, 3, 3), np.nan)
         sigma, correlation = np.full((count, T), np.nan), np.full((count, T), np.nan)
-        n_views = np.zeros((count, T), int)
+        n_views, sight = np.zeros((count, T), int), np.zeros((count, T, 3))
         first, placed = np.zeros((count, 3, 3)), np.zeros(count, int)
         for frame, identity, frames in self._placed:
             first[identity], placed[identity] = frames, frame
@@ -101,14 +94,15 @@ class TrackRecord:
             positions[m.identity, m.frame] = m.positions
             rotations[m.identity, m.frame] = m.frames @ np.swapaxes(first[m.identity], 1, 2)
             sigma[m.identity, m.frame], correlation[m.identity, m.frame] = m.sigma, m.correlation
-            n_views[m.identity, m.frame] = m.n_views
+            n_views[m.identity, m.frame], sight[m.identity, m.frame] = m.n_views, m.sight
         end, begin = np.full(count, LAST_FRAME), np.full(count, LAST_FRAME)
         for forward, identity, reason in self._ends:
             (end if forward else begin)[identity] = reason
-        return Trajectories(positions, rotations, sigma, correlation, n_views, first[:, :, 2], placed, end, begin)
+        normals = first[:, :, 2]
+        return Trajectories(positions, rotations, sigma, correlation, n_views, sight, normals, placed, end, begin)
 
 
-def _rays(positions: np.ndarray, camera: np.ndarray, centers: np.ndarray) -> np.ndarray:
+def _sight(positions: np.ndarray, camera: np.ndarray, centers: np.ndarray) -> np.ndarray:
     """Unit vectors (A, 3) to positions (A, 3) from cameras (A,); 0 for camera −1."""
     ray = positions - centers[camera]
     return np.where(camera[:, None] < 0, 0.0, ray / np.linalg.norm(ray, axis=1, keepdims=True))

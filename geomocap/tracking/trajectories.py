@@ -45,6 +45,8 @@ class Trajectories:
         Mean correlation over the cameras that saw it.
     n_views : (N, T) int
         Cameras that saw it, 0 where it was not measured.
+    sight : (N, T, 3) float
+        Unit vectors from the only camera that saw it, along which its depth is unsure; 0 where several did, or none.
     normals : (N, 3) float
         Outward normal of the surface in the frame `placed`.
     placed : (N,) int
@@ -58,6 +60,7 @@ class Trajectories:
     sigma: np.ndarray
     correlation: np.ndarray
     n_views: np.ndarray
+    sight: np.ndarray
     normals: np.ndarray
     placed: np.ndarray
     end_reason: np.ndarray
@@ -72,6 +75,7 @@ class Trajectories:
             "sigma": (N, T),
             "correlation": (N, T),
             "n_views": (N, T),
+            "sight": (N, T, 3),
             "normals": (N, 3),
             "placed": (N,),
             "end_reason": (N,),
@@ -123,6 +127,7 @@ class Trajectories:
             np.where(drop, np.nan, self.sigma),
             np.where(drop, np.nan, self.correlation),
             np.where(drop, 0, self.n_views),
+            np.where(drop[:, :, None], 0.0, self.sight),
             self.normals,
             self.placed,
             self.end_reason,

@@ -31,6 +31,7 @@ def make_tracks(positions: np.ndarray, rotations: np.ndarray | None = None) -> T
         np.where(seen, 1e-3, np.nan),
         np.where(seen, 0.95, np.nan),
         np.where(seen, 3, 0),
+        np.zeros((N, T, 3)),
         np.tile([0.0, 0, 1], (N, 1)),
         zero,
         zero.copy(),

@@ -1,11 +1,13 @@
 import numpy as np
 import pytest
 from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.optimize import least_squares
 from scipy.spatial.distance import squareform
 from scipy.spatial.transform import Rotation
 
 from geomocap.segmentation.connected_linkage import connected_linkage
 from geomocap.segmentation.local_rotations import local_rotations, turn_distances
+from geomocap.segmentation.motion_paths import sure_part
 from geomocap.segmentation.rigid_motions import fit_rigid_motion, turn_angles
 from geomocap.segmentation.skin_blending import explain
 from geomocap.segmentation.surface_graph import bridges, lasting_distances, surface_graph
@@ -81,6 +83,70 @@ def test_rigid_motion_is_steady_against_samples_that_do_not_follow():
     assert residuals[:8].min() > residuals[8:].max()
 
 
+def seen_by_single_cameras(noise_along: float) -> tuple[np.ndarray, ...]:
+    """A turning body whose samples three cameras see, each one alone: true motion, positions, lines of sight."""
+    rng = np.random.default_rng(8)
+    rest = rng.normal(scale=0.1, size=(60, 3))
+    true = Rotation.from_rotvec(rng.normal(scale=0.4, size=(6, 3))).as_matrix()
+    positions = np.einsum("tij,nj->nti", true, rest) + 0.5
+    sight = np.repeat(np.eye(3)[np.arange(60) % 3][:, None], 6, axis=1)
+    off = rng.normal(scale=noise_along, size=(60, 6, 1)) * sight + rng.normal(scale=1e-3, size=(60, 6, 3))
+    return rest, true, positions + off, sight
+
+
+def test_what_is_unsure_along_the_line_of_sight_does_not_turn_a_body():
+    rest, true, positions, sight = seen_by_single_cameras(0.02)
+    weights = np.ones((60, 6))
+    errors = []
+    for known in (None, sight):
+        rotations = fit_rigid_motion(positions, rest, weights, 1e-4, sight=known)[0]
+        errors.append(np.rad2deg(turn_angles(rotations.swapaxes(1, 2) @ true)).mean())
+    assert errors[1] < 0.35 * errors[0]
+
+
+def test_a_motion_with_lines_of_sight_is_the_least_squares_one():
+    rest, _, positions, sight = seen_by_single_cameras(0.02)
+    weights = np.random.default_rng(9).random((60, 6)) + 0.5
+    least = 1e3  # residuals of this scale are all the same: no robust weights
+    rotations, translations, _ = fit_rigid_motion(positions, rest, weights, least, sight=sight)
+
+    def misses(motion: np.ndarray) -> np.ndarray:
+        carried = Rotation.from_rotvec(motion[:3]).apply(rest) + motion[3:]
+        return (np.sqrt(weights[:, 2, None]) * sure_part(carried - positions[:, 2], sight[:, 2])).ravel()
+
+    found = np.concatenate([Rotation.from_matrix(rotations[2]).as_rotvec(), translations[2]])
+    np.testing.assert_allclose(found, least_squares(misses, np.zeros(6), xtol=1e-12).x, atol=1e-6)
+
+
+def test_blends_with_lines_of_sight_are_those_of_a_search():
+    rng = np.random.default_rng(10)
+    rotations = Rotation.from_rotvec(rng.normal(scale=0.4, size=(10, 3))).as_matrix().reshape(2, 5, 3, 3)
+    translations = rng.normal(scale=0.1, size=(2, 5, 3))
+    rest, weights = rng.random((3, 3)), rng.random((3, 5)) + 0.2
+    carried = np.einsum("btij,nj->nbti", rotations, rest) + translations[None]
+    sight = rng.normal(size=(3, 5, 3))
+    sight /= np.linalg.norm(sight, axis=2, keepdims=True)
+    positions = 0.7 * carried[:, 0] + 0.3 * carried[:, 1] + rng.normal(scale=0.02, size=(3, 5, 1)) * sight
+    everything = np.ones((3, 2), bool), np.ones((2, 2), bool)
+    of = (positions, weights, sight, rest)
+    blends = explain(*of, np.ones(3, bool), rotations, translations, *everything, 0.01, 10.0)
+    for i in range(3):
+        shares = np.linspace(0.5, 1.0, 2001)[:, None, None]
+        miss = sure_part(shares * carried[i, 0] + (1 - shares) * carried[i, 1] - positions[i], sight[i])
+        w = shares[:, 0, 0]
+        costs = np.average((miss**2).sum(axis=2), weights=weights[i], axis=1) + 4 * w * (1 - w) * 1e-4
+        assert blends.costs[i, 0] == pytest.approx(costs.min(), rel=1e-3)
+        assert blends.share[i, 0] == pytest.approx(w[costs.argmin()], abs=2e-3)
+    # a sample whose place at rest is open gets the one that fits best
+    alone = explain(*of, np.zeros(3, bool), rotations, translations, *everything[:1], np.zeros((2, 2), bool), 0.0, 10.0)
+
+    def misses(place: np.ndarray) -> np.ndarray:
+        there = rotations[1] @ place + translations[1]
+        return (np.sqrt(weights[0] / weights[0].sum())[:, None] * sure_part(there - positions[0], sight[0])).ravel()
+
+    assert alone.costs[0, 1] == pytest.approx(2.0 * least_squares(misses, rest[0], xtol=1e-12).cost, rel=1e-6)
+
+
 def test_blends_are_those_of_a_search_over_weights():
     rng = np.random.default_rng(7)
     rotations = Rotation.from_rotvec(rng.normal(scale=0.4, size=(15, 3))).as_matrix().reshape(3, 5, 3, 3)
@@ -92,7 +158,9 @@ def test_blends_are_those_of_a_search_over_weights():
     positions = np.einsum("nb,nbti->nti", mix, carried) + rng.normal(scale=0.003, size=(4, 5, 3))
     penalty = 0.02
     everything = np.ones((4, 3), bool), np.ones((3, 3), bool)
-    blends = explain(positions, weights, rest, np.ones(4, bool), rotations, translations, *everything, penalty, 10.0)
+    blends = explain(
+        positions, weights, None, rest, np.ones(4, bool), rotations, translations, *everything, penalty, 10.0
+    )
     for i in range(4):
         best = {}
         for a in range(3):

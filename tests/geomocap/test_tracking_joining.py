@@ -27,6 +27,7 @@ def rigid(points, first, noise=0.0):
         np.full((N, T), 0.0002),
         np.ones((N, T)),
         np.full((N, T), 3),
+        np.zeros((N, T, 3)),
         np.tile([0.0, 0, 1], (N, 1)),
         np.asarray(first),
         flat,

@@ -1,5 +1,7 @@
 """Depths of patches that one camera alone sees, adjusted to what is around them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -34,6 +36,7 @@ def limb() -> tuple[Trajectories, np.ndarray, np.ndarray]:
         ones * DEPTH_STD / np.sqrt(3),
         ones,
         ones.astype(int),
+        rays,
         side,
         zeros,
         zeros,
@@ -45,7 +48,7 @@ def limb() -> tuple[Trajectories, np.ndarray, np.ndarray]:
 @pytest.fixture(scope="module")
 def scene():
     tracks, truth, rays = limb()
-    return tracks, truth, rays, adjust_depths(tracks, rays)
+    return tracks, truth, rays, adjust_depths(tracks)
 
 
 def wobble(positions, truth, rays):
@@ -75,7 +78,8 @@ def test_what_several_cameras_see_stays(scene):
     positions[5, 3:6] = np.nan
     gaps = tracks.without(np.isnan(positions[:, :, 0]))
     some[np.isnan(positions[:, :, 0])] = 0
-    adjusted = adjust_depths(gaps, some)
+    adjusted = adjust_depths(replace(gaps, sight=some))
     assert_allclose(adjusted.positions[::2], gaps.positions[::2])
     assert np.isnan(adjusted.positions[5, 3:6]).all() and np.isfinite(adjusted.positions[4]).all()
-    assert adjust_depths(tracks, np.zeros_like(rays)) is tracks
+    known = replace(tracks, sight=np.zeros_like(rays))
+    assert adjust_depths(known) is known
