@@ -17,7 +17,7 @@ from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.segmentation.rigid_motions import turn_angles
 from geomocap.skeleton.hierarchy import Hierarchy
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
-from tests.geomocap.moving_chains import Chain, chain
+from tests.geomocap.moving_chains import Chain, chain, seen_by_single_cameras
 
 
 def linked(scene: Chain, hinges: bool = False):
@@ -265,6 +265,17 @@ def test_joint_that_is_none_does_not_bend_the_motion():
     true = scene.rotations[:, [0, 2]]
     assert turn_errors_deg(held.bodies.rotations, true).mean() > 5.0
     assert turn_errors_deg(loose.bodies.rotations, true).mean() < 0.1
+
+
+def test_refinement_hardly_heeds_what_is_unsure_along_the_line_of_sight():
+    scene = chain(3)
+    linkage, motion, points = linked(scene)
+    positions, sight = seen_by_single_cameras(scene, 0.02)
+    errors = [
+        turn_errors_deg(refine_motion(linkage, motion, points, paths, 1.3).bodies.rotations, scene.rotations).mean()
+        for paths in (MotionPaths(positions), MotionPaths(positions, sight=sight))
+    ]
+    assert errors[1] < 0.4 * errors[0]
 
 
 def test_refined_skeleton_is_nearer_to_the_truth_and_keeps_its_bones():

@@ -15,7 +15,7 @@ from geomocap.skeleton.common_points import common_point
 from geomocap.skeleton.hierarchy import Hierarchy
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
 from geomocap.skeleton.temporal_smoothing import smooth_positions, smooth_rotations
-from tests.geomocap.moving_chains import chain, same_partition
+from tests.geomocap.moving_chains import chain, same_partition, seen_by_single_cameras
 
 
 @pytest.fixture(scope="module")
@@ -152,6 +152,18 @@ def test_a_single_rigid_body_is_one_without_joints(moving):
     skeleton = find_motion_skeleton(bodies, 30.0).skeleton
     assert skeleton.joint_positions.shape == (24, 0, 3)
     assert skeleton.root == 0
+
+
+def test_bodies_that_single_cameras_see_turn_as_what_they_see_across_says(three):
+    positions, sight = seen_by_single_cameras(three, 0.02)
+    errors = []
+    for known in (None, sight):
+        paths = MotionPaths(positions, sigma=np.full(270, 0.012), sight=known)
+        bodies = find_motion_bodies(paths, MotionBodiesSettings(bodies=3))
+        true = [np.bincount(three.body[bodies.label == b]).argmax() for b in range(3)]
+        difference = np.swapaxes(bodies.rotations, 2, 3) @ three.rotations[:, true]
+        errors.append(np.rad2deg(turn_angles(difference)).mean())
+    assert errors[1] < 0.4 * errors[0]
 
 
 def test_broken_paths_give_the_same_bodies(three):
