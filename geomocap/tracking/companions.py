@@ -17,6 +17,7 @@ _COUNT = 12
 _ENOUGH = 3  # companions whose places must be known
 _RINGS = 8  # of lost patches, each one placed by those before
 _ROUNDS = 5
+_AHEAD = 1.5  # frames; what another motion would do in them counts as distance
 
 
 @dataclass(frozen=True)
@@ -53,20 +54,31 @@ class Companions:
         )
 
     def met(
-        self, who: np.ndarray, among: np.ndarray, identity: np.ndarray, positions: np.ndarray, frames: np.ndarray
+        self,
+        who: np.ndarray,
+        among: np.ndarray,
+        identity: np.ndarray,
+        place: tuple[np.ndarray, np.ndarray],
+        motion: tuple[np.ndarray, np.ndarray],
     ) -> Companions:
-        """Return them with others for patches `who` (A,): the nearest of patches `among` (B,), to which `who` belong.
+        """Return them with others for patches `who`: of those near, the ones that moved like them.
 
         Parameters
         ----------
         who, among : (A,), (B,) int
+            Patches, and those that may be their companions; `who` belong to `among`.
         identity : (N,) int
-        positions, frames : (N, 3), (N, 3, 3) float
-            Of all patches.
+        place : positions (N, 3), frames (N, 3, 3)
+        motion : shifts (N, 3), metres, and turns (N, 3), rotation vectors, from frame to frame
         """
-        near = nearest(positions, who, among, _COUNT)
+        (positions, frames), (shift, turn) = place, motion
+        near = nearest(positions, who, among, 2 * _COUNT)
         if not near.size:
             return self
+        arm = positions[who][:, None] - positions[near]
+        unlike = shift[near] + np.cross(turn[near], arm) - shift[who][:, None]
+        cost = np.linalg.norm(arm, axis=2) + _AHEAD * np.linalg.norm(unlike, axis=2)
+        near = np.take_along_axis(near, np.argsort(cost, axis=1, kind="stable")[:, :_COUNT], axis=1)
         count = near.shape[1]
         back = np.swapaxes(frames[near], 2, 3)
         new = Companions(*(getattr(self, f.name).copy() for f in fields(self)))

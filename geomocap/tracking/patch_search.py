@@ -79,8 +79,8 @@ class Followed:
         """Return them with companions for those that were measured and are not in the next frame, `good` (N,)."""
         measured = self.gap == 0
         gone, there = np.flatnonzero(measured & ~good), np.flatnonzero(measured)
-        p = self.patches
-        return replace(self, companions=self.companions.met(gone, there, self.identity, p.positions, p.frames))
+        place, motion = (self.patches.positions, self.patches.frames), (self.velocity, self.spin)
+        return replace(self, companions=self.companions.met(gone, there, self.identity, place, motion))
 
     def select(self, which: np.ndarray) -> Followed:
         """Return some of them, by a mask or by positions."""

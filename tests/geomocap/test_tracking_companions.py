@@ -28,7 +28,7 @@ def moved_limb():
 
 def remembered(who, among=None):
     among = np.arange(N) if among is None else among
-    return Companions.none(N).met(who, among, IDENTITY, POSITIONS, FRAMES)
+    return Companions.none(N).met(who, among, IDENTITY, (POSITIONS, FRAMES), (np.zeros((N, 3)), np.zeros((N, 3))))
 
 
 def test_a_lost_patch_goes_with_most_of_its_companions():
@@ -75,6 +75,24 @@ def test_what_is_found_must_lie_among_its_companions(sure):
     assert agreed[right].mean() > 0.9
     scattered = at + RNG.normal(0, 0.05, at.shape)
     assert not companions.agreed(IDENTITY, ~ON_LIMB, doubtful, scattered, turned, np.full(N, 0.005)).any()
+
+
+def test_companions_are_those_that_moved_alike():
+    """A limb that turns on the trunk it lies against has companions of its own, though others are as near."""
+    positions = POSITIONS[RNG.permutation(N)] * (1, 0.2, 1)  # both in one place
+    spin = np.where(ON_LIMB[:, None], (0.0, 0.0, 1.5), 0.0)
+    on_limb = dict(zip(IDENTITY.tolist(), ON_LIMB.tolist(), strict=True))
+
+    def own_share(turn):
+        motion = np.cross(turn, positions), turn
+        found = Companions.none(N).met(np.arange(N), np.arange(N), IDENTITY, (positions, FRAMES), motion)
+        same = [
+            [on_limb[j] == on_limb[i] for j in row] for i, row in zip(IDENTITY, found.identity.tolist(), strict=True)
+        ]
+        return np.mean(same)
+
+    assert own_share(spin) > 0.9
+    assert own_share(np.zeros((N, 3))) < 0.7
 
 
 def test_companions_stay_with_their_patches():
