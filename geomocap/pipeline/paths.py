@@ -16,6 +16,7 @@ SAMPLES = 2000  # motion paths that bodies are found from
 LEAST_SAMPLES = 300  # fewer long trajectories than these don't cover a subject: nodes are tracked instead
 LEAST_COVERAGE = 0.4  # nor do trajectories that are measured, on average, in a smaller share of the frames
 ANCHORS = 2000  # trajectories that keep nodes from sliding
+ALONE_SHARE = 0.5  # of the standard deviation of what a single camera sees, as most of that is depth and hardly counts
 ANCHOR_SHARE = 0.1  # those are measured in this share of the frames at least
 
 
@@ -58,13 +59,13 @@ def patch_paths(tracked: dict[str, np.ndarray]) -> MotionPaths | None:
     if not len(chosen):
         return None
     sigma = tracked["sigma"][chosen]
-    sight = tracked["sight"][chosen].astype(float) if "sight" in tracked else np.zeros(0)
     # standard deviations with the median where a sample was not seen
-    return MotionPaths(
-        tracked["positions"][chosen],
-        sigma=np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma)),
-        sight=sight if sight.any() else None,
-    )
+    sigma = np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma))
+    sight = tracked["sight"][chosen].astype(float) if "sight" in tracked else np.zeros((*sigma.shape, 3))
+    alone = sight.any(axis=2)
+    if not alone.any():
+        return MotionPaths(tracked["positions"][chosen], sigma=sigma)
+    return MotionPaths(tracked["positions"][chosen], sigma=np.where(alone, ALONE_SHARE, 1.0) * sigma, sight=sight)
 
 
 def _covers(paths: MotionPaths) -> bool:
