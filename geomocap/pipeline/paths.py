@@ -13,10 +13,10 @@ from geomocap.tracking.nodes import track_nodes
 from geomocap.tracking.selection import spread_out
 
 SAMPLES = 2000  # motion paths that bodies are found from
+ALONE_SHARE = 0.5  # of the standard deviation of what a single camera sees, as most of that is depth and hardly counts
 LEAST_SAMPLES = 300  # fewer long trajectories than these don't cover a subject: nodes are tracked instead
 LEAST_COVERAGE = 0.4  # nor do trajectories that are measured, on average, in a smaller share of the frames
 ANCHORS = 2000  # trajectories that keep nodes from sliding
-ALONE_SHARE = 0.5  # of the standard deviation of what a single camera sees, as most of that is depth and hardly counts
 ANCHOR_SHARE = 0.1  # those are measured in this share of the frames at least
 
 

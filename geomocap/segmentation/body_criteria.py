@@ -149,8 +149,8 @@ def _turn(first: int, second: int, model: BodyModel, evidence: Evidence) -> floa
     if known.sum() < min(_LEAST_FRAMES, len(known)):
         known[:] = True
     one, other = model.rotations[first, known], model.rotations[second, known]
-    if min(evidence.tied[model.label == body].sum() for body in (first, second)) < 3:
-        # nothing ties the body to the reference: its turn counts from the middle of the frames
+    if min(evidence.seen[model.label == body, 0].sum() for body in (first, second)) < 3:
+        # nothing ties the body to frame 0: its turn counts from the middle of the frames
         at = len(one) // 2
         return relative_turn(one @ one[at].T, other @ other[at].T, _TURN_SHARE)
     turn = relative_turn(one, other, _TURN_SHARE)

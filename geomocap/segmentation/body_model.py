@@ -34,10 +34,8 @@ class Evidence:
         Directions along which positions are unsure, see `MotionPaths`.
     rest : (N, 3) float, metres
         Positions in the reference.
-    tied : (N,) bool
-        Samples that were seen in the reference.
     certain : (N,) bool
-        Those among them whose place there is sure; the place of others is found by their body.
+        Samples whose place in the reference, frame 0, was seen and is sure; that of others is found by their body.
     turns : (N, N) float32, radians
         How differently two samples turn.
     adjacency : (N, N) csr_matrix
@@ -60,7 +58,6 @@ class Evidence:
     sigma: np.ndarray
     sight: np.ndarray | None
     rest: np.ndarray
-    tied: np.ndarray
     certain: np.ndarray
     turns: np.ndarray
     adjacency: csr_matrix

@@ -181,7 +181,7 @@ def find_motion_bodies(
     # Paths without gaps, the surface, and how it turns
     positions, certainty = complete_tracks(paths)
     weights = np.where(paths.seen, paths.weights(), 0.1 * certainty)
-    reference = positions[:, 0] if paths.reference is None else np.asarray(paths.reference, float)
+    reference = positions[:, 0]  # of samples that are not seen there, as their neighbours carry them back
     graph = surface_graph(positions, reference, settings.neighbours, settings.max_stretch)
     progress(_STAGE, 1, 4)
     radius = max(settings.radius * extent, 2.5 * graph.spacing)
@@ -229,8 +229,7 @@ def _evidence(
     settings: MotionBodiesSettings,
 ) -> Evidence:
     near = csr_matrix(np.isfinite(graph.geodesics(max(settings.reach * extent, 3.0 * graph.spacing))).astype(float))
-    tied = np.full(paths.count, True) if paths.reference is not None else paths.seen[:, 0]
-    sure = paths.reference is not None or paths.sight is None or ~paths.sight[:, 0].any(axis=1)
+    certain = paths.seen[:, 0] if paths.sight is None else paths.seen[:, 0] & ~paths.sight[:, 0].any(axis=1)
     return Evidence(
         positions,
         weights,
@@ -238,8 +237,7 @@ def _evidence(
         paths.typical_sigma(),
         paths.sight,
         rest,
-        tied,
-        tied & sure,
+        certain,
         turns,
         graph.adjacency,
         near,

@@ -22,16 +22,12 @@ class MotionPaths:
     positions : (N, T, 3) float, metres, world
         NaN where a sample was not followed.
     rotations : (N, T, 3, 3) float, optional
-        Turn of each sample since the reference, world axes; NaN where not known. All samples of one rigid body have the
-        same: without a common reference for all of them, leave them out.
+        Turn of each sample since frame 0, world axes; NaN where not known. All samples of one rigid body have the same.
     sigma : (N,) or (N, T) float, optional
         Standard deviation of the positions, metres.
     sight : (N, T, 3) float, optional
         Unit vectors along which positions are unsure, as of those that a single camera sees: what is missed along them
         counts a tenth. 0: sure in all directions.
-    reference : (N, 3) float, optional
-        Positions of all samples at one time, metres, world. The motion is counted from there; without it, from frame 0
-        (samples that are not seen there are carried back by their neighbours).
     parts : (N,) int, optional
         Rigid parts, from 0, that the samples are known to move with; bodies are joined of these.
     """
@@ -40,7 +36,6 @@ class MotionPaths:
     rotations: np.ndarray | None = None
     sigma: np.ndarray | None = None
     sight: np.ndarray | None = None
-    reference: np.ndarray | None = None
     parts: np.ndarray | None = None
 
     def __post_init__(self) -> None:
@@ -53,7 +48,6 @@ class MotionPaths:
             "rotations": (self.rotations, [(count, frames, 3, 3)]),
             "sigma": (self.sigma, [(count,), (count, frames)]),
             "sight": (self.sight, [(count, frames, 3)]),
-            "reference": (self.reference, [(count, 3)]),
             "parts": (self.parts, [(count,)]),
         }
         for name, (array, shapes) in optional.items():

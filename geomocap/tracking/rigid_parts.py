@@ -37,8 +37,8 @@ _RESTING_SHARE = 0.05  # least share of the nodes that rest side by side
 _LOOKED_AT = 10  # frames that say which part a node follows
 _FIRST = (0.8, 0.6, 0.5, 0.4, 0.4, 0.3)  # node spacings
 _AGAIN = (0.5, 0.4, 0.3)
-_LAST_STEPS = 2  # of them, after the best start is known; those before look at
-_THINNED = 2  # one sample in so many
+_LAST_STEPS = 2  # of them, after the best start is known
+_THINNED = 2  # before, one sample in so many is looked at
 _ASTRAY = 0.01  # a part leaves the motion it had in the frame before for one that misses less by so much
 _FORMS = ("R", "t", "form", "slope", "cost", "weight")
 

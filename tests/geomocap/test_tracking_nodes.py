@@ -280,7 +280,6 @@ def test_motion_paths_of_nodes(bending):
     _, tracks = bending
     paths = tracks.motion_paths()
     assert paths.count == 150
-    assert paths.reference is None  # motion counts from frame 0, whichever frame the tracking started from
     assert np.isfinite(tracks.sigma).all()
 
 
