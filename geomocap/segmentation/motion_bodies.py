@@ -35,6 +35,12 @@ class MotionBodiesSettings(Settings):
     min_turn_deg: float = Field(
         default=15.0, gt=0, lt=180, description="a body turns at least this much against each neighbour (degrees)"
     )
+    part_turn_deg: float = Field(
+        default=12.0,
+        gt=0,
+        lt=180,
+        description="the same where samples move with rigid parts, whose turns are known better (degrees)",
+    )
     min_excess_deg: float = Field(
         default=3.5,
         gt=0,
@@ -57,7 +63,8 @@ class MotionBodiesSettings(Settings):
         default=0.18,
         ge=0,
         lt=1,
-        description="soft skin turns by a fixed part of what the bodies beside it do, to this share of it (0..1)",
+        description="soft skin turns by a fixed part of what the bodies beside it do, to this share of it (0..1); "
+        "0 where samples move with rigid parts",
     )
     neighbours: int = Field(default=10, ge=4, description="neighbours of a sample on the surface")
     max_stretch: float = Field(
@@ -154,10 +161,10 @@ def find_motion_bodies(
 
     Every sample's neighbourhood on the surface has a rotation since frame 0, whatever lever arms there are. Samples
     that turn alike are grouped (average linkage along the surface), too finely, unless the paths say which rigid parts
-    they are of. Each group gets a rigid motion, each
-    sample follows one body or a blend of two, and then the weakest body goes, again and again, until each one left
-    turns against its neighbours and is not explained by blends of them. At last, parts of soft skin go, which turn by a
-    fixed share of what the bodies beside them do, and bodies of too few samples.
+    they are of. Each group gets a rigid motion, each sample follows one body or a blend of two, and then the weakest
+    body goes, again and again, until each one left turns against its neighbours and is not explained by blends of
+    them. At last, parts of soft skin go, which turn by a fixed share of what the bodies beside them do, and bodies of
+    too few samples. A rigid part was registered on its own: it is no skin, and its turn is known better.
 
     Parameters
     ----------
@@ -203,12 +210,19 @@ def find_motion_bodies(
             model = reassign(refit(model, evidence, np.arange(model.count)), evidence, 1).compact()
     progress(_STAGE, 3, 4)
     # Those that are there
-    turn, excess = np.deg2rad(settings.min_turn_deg), np.deg2rad(settings.min_excess_deg)
-    criterion = Criterion(turn, excess, _RADIUS * extent, settings.min_share, settings.soft_share)
+    criterion = _criterion(extent, settings, rigid=paths.parts is not None)
     left = eliminate(model, evidence, criterion, settings.bodies or None)
     model = reassign(left.model, left.evidence, 3).compact()
     progress(_STAGE, 4, 4)
     return _result(model, left.evidence, paths, graph, left.curve, linkage, extent)
+
+
+def _criterion(extent: float, settings: MotionBodiesSettings, rigid: bool) -> Criterion:
+    """When a body is one; rigid parts turn as a whole, and none that points suit on its own is a piece of soft skin."""
+    turn, softness = (settings.part_turn_deg, 0.0) if rigid else (settings.min_turn_deg, settings.soft_share)
+    return Criterion(
+        np.deg2rad(turn), np.deg2rad(settings.min_excess_deg), _RADIUS * extent, settings.min_share, softness
+    )
 
 
 def _known_rotations(paths: MotionPaths, fitted: np.ndarray) -> np.ndarray:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -60,6 +62,12 @@ def test_bodies_are_joined_of_known_parts(three):
     assert together.body_count <= 2
 
 
+def test_rigid_parts_that_turn_by_less_are_bodies():
+    two = chain(2, turn_deg=13.0)
+    assert find_motion_bodies(MotionPaths(two.positions)).body_count == 1
+    assert find_motion_bodies(MotionPaths(two.positions, parts=two.body)).body_count == 2
+
+
 def test_number_of_bodies_can_be_given(three):
     for wanted in (2, 4):
         assert (
@@ -100,6 +108,8 @@ def test_deep_soft_skin_between_three_bodies_is_no_fourth(seed):
     carried = np.einsum("tbij,nj->nbti", three.rotations, rest) + three.translations.swapaxes(0, 1)[None]
     paths = MotionPaths(np.einsum("nb,nbti->nti", weights, carried))
     assert find_motion_bodies(paths, MotionBodiesSettings(soft_share=0.0)).body_count > 3
+    pieces = np.digitize(rest[:, 0], np.linspace(0.0, 1.2, 10)[1:-1])  # rigid parts are no skin
+    assert find_motion_bodies(replace(paths, parts=pieces)).body_count > 3
     bodies = find_motion_bodies(paths)
     assert bodies.body_count == 3
     core = weights.max(axis=1) > 0.8
