@@ -17,6 +17,7 @@ _MOST_NEIGHBOURS = 7
 _CORE = 0.4
 _CLEARLY = np.deg2rad(40.0)
 _TIP_QUANTILE = 0.8
+_UNEVEN = np.deg2rad(10.0)  # samples side by side that turn more differently are unsure
 _TURN_SHARE = 0.02
 _LEAST_SEEN = 0.1
 _LEAST_FRAMES = 5
@@ -144,7 +145,10 @@ def may_be_joined(
 
 
 def _turn(first: int, second: int, model: BodyModel, evidence: Evidence) -> float:
-    """Turn of two bodies against each other: mean of that of their motions and of their most different parts."""
+    """Turn of two bodies against each other: mean of that of their motions and of their most different parts.
+
+    Where samples side by side turn so differently that they are unsure, that of the motions counts more.
+    """
     known = _seen(first, model, evidence) & _seen(second, model, evidence)
     if known.sum() < min(_LEAST_FRAMES, len(known)):
         known[:] = True
@@ -160,7 +164,10 @@ def _turn(first: int, second: int, model: BodyModel, evidence: Evidence) -> floa
     b = np.flatnonzero((model.label == second) & model.core)
     if min(len(a), len(b)) < 4:
         return turn
-    return 0.5 * (turn + float(np.quantile(evidence.turns[np.ix_(a, b)], _TIP_QUANTILE)))
+    tips = float(np.quantile(evidence.turns[np.ix_(a, b)], _TIP_QUANTILE))
+    uneven = np.sqrt(np.mean([np.median(evidence.unevenness[some]) ** 2 for some in (a, b)]))
+    share = 0.5 * min(1.0, (_UNEVEN / max(float(uneven), 1e-9)) ** 2)
+    return (1.0 - share) * turn + share * tips
 
 
 def _seen(body: int, model: BodyModel, evidence: Evidence) -> np.ndarray:

@@ -38,6 +38,8 @@ class Evidence:
         Samples whose place in the reference, frame 0, was seen and is sure; that of others is found by their body.
     turns : (N, N) float32, radians
         How differently two samples turn.
+    unevenness : (N,) float, radians
+        How differently from its neighbours a sample turns, their median: mostly how unsure that is.
     adjacency : (N, N) csr_matrix
         Neighbours on the surface.
     near : (N, N) csr_matrix
@@ -60,6 +62,7 @@ class Evidence:
     rest: np.ndarray
     certain: np.ndarray
     turns: np.ndarray
+    unevenness: np.ndarray
     adjacency: csr_matrix
     near: csr_matrix
     penalty: float

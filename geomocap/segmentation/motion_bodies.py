@@ -253,6 +253,7 @@ def _evidence(
         rest,
         certain,
         turns,
+        _unevenness(turns, graph.adjacency),
         graph.adjacency,
         near,
         settings.blend_penalty * extent if settings.blends else np.inf,
@@ -260,6 +261,11 @@ def _evidence(
         2e-4 * extent,
         settings.smoothness,
     )
+
+
+def _unevenness(turns: np.ndarray, adjacency: csr_matrix) -> np.ndarray:
+    beside = np.split(adjacency.indices, adjacency.indptr[1:-1])
+    return np.array([np.median(turns[i, others]) if len(others) else 0.0 for i, others in enumerate(beside)])
 
 
 def absorb_small(label: np.ndarray, turns: np.ndarray, graph: SurfaceGraph, least: int) -> np.ndarray:

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
@@ -66,6 +67,14 @@ def test_rigid_parts_that_turn_by_less_are_bodies():
     two = chain(2, turn_deg=13.0)
     assert find_motion_bodies(MotionPaths(two.positions)).body_count == 1
     assert find_motion_bodies(MotionPaths(two.positions, parts=two.body)).body_count == 2
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_bodies_are_not_split_where_turns_are_unsure(three, seed):
+    drift = gaussian_filter1d(np.random.default_rng(seed).normal(size=three.positions.shape), 3, axis=1)
+    drift *= 0.0027 / drift.std()  # metres, of boxes 0.12 m wide
+    paths = MotionPaths(three.positions + drift, sigma=np.full(len(drift), 0.0027))
+    assert find_motion_bodies(paths).body_count == 3
 
 
 def test_number_of_bodies_can_be_given(three):
