@@ -30,7 +30,7 @@ from geomocap.matching.spline import FAST
 from geomocap.tracking.patch_templates import (
     LEAST_SAMPLES,
     LEAST_VARIANCE,
-    bilinear,
+    inverse_diagonal,
     local_camera,
     set_place,
     solve_normal,
@@ -42,20 +42,21 @@ LEAST_FACING = 0.2
 
 _FLOOR = 2.0  # noise of an image that even a perfect fit is granted, grey levels
 COHERENT = 0.15  # share of the samples over which residuals beyond that go together
+_TOGETHER = 32  # patches of a thread before it asks for more
 _GAIN = 3.0  # most contrast that an image may lose or win against the template
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _prepare(A, center, shape, template, usable, mask, use_mask, with_slopes, stride, samples, J, T, moments):
+def _prepare(A, center, shape, template, usable, mask, use_mask, with_slopes, stride, places, J, T, moments):
     """Choose the samples of one camera and form their Jacobian, free of offset and gain.
 
-    Returns the number of samples; 0 if too few are seen. `moments`: variance of the template.
+    Returns the number of samples; 0 if too few are seen. Filled are the samples' `places` (3, M) in the patch, their
+    Jacobian `J` (6, M), grey levels `T` (M,) and, in `moments`, the variance of these.
     """
     M = len(shape)
     H, W = mask.shape
     count, offered = 0, 0
     mean_t = 0.0
-    mean_j = np.zeros(6)
     for q in range(0, M, stride):
         if not usable[q]:
             continue
@@ -68,83 +69,94 @@ def _prepare(A, center, shape, template, usable, mask, use_mask, with_slopes, st
         w = A[2, 0] * s + A[2, 1] * t + A[2, 2] * z + A[2, 3]
         if w <= 0:
             continue
-        x = (A[0, 0] * s + A[0, 1] * t + A[0, 2] * z + A[0, 3]) / w
-        y = (A[1, 0] * s + A[1, 1] * t + A[1, 2] * z + A[1, 3]) / w
+        closeness = 1.0 / w
+        x = (A[0, 0] * s + A[0, 1] * t + A[0, 2] * z + A[0, 3]) * closeness
+        y = (A[1, 0] * s + A[1, 1] * t + A[1, 2] * z + A[1, 3]) * closeness
         if not (x >= 1 and y >= 1 and x < W - 2 and y < H - 2):
             continue
         if use_mask and mask[int(y + 0.5), int(x + 0.5)] == 0:
             continue
-        samples[count] = q
+        places[0, count], places[1, count], places[2, count] = s, t, z
         T[count] = template[q, 0]
         mean_t += template[q, 0]
+        if with_slopes:
+            ts, tt = template[q, 1], template[q, 2]
+            g2 = (ts * d0 + tt * d1) / facing
+            g0, g1 = ts - zs * g2, tt - zt * g2
+            J[0, count], J[1, count], J[2, count] = g0, g1, g2
+            J[3, count], J[4, count], J[5, count] = t * g2 - z * g1, z * g0 - s * g2, s * g1 - t * g0
         count += 1
-        if not with_slopes:
-            continue
-        ts, tt = template[q, 1], template[q, 2]
-        g2 = (ts * d0 + tt * d1) / facing
-        g0, g1 = ts - zs * g2, tt - zt * g2
-        i = count - 1
-        J[i, 0], J[i, 1], J[i, 2] = g0, g1, g2
-        J[i, 3], J[i, 4], J[i, 5] = t * g2 - z * g1, z * g0 - s * g2, s * g1 - t * g0
-        for r in range(6):
-            mean_j[r] += J[i, r]
     if count < LEAST_SAMPLES * offered or count < 12:
         return 0
     mean_t /= count
     variance = 0.0
-    along = np.zeros(6)
-    for r in range(6):
-        mean_j[r] /= count
     for i in range(count):
         T[i] -= mean_t
         variance += T[i] * T[i]
-        if with_slopes:
-            for r in range(6):
-                J[i, r] -= mean_j[r]
-                along[r] += J[i, r] * T[i]
     if variance < LEAST_VARIANCE * count:
         return 0
-    if with_slopes:
-        for i in range(count):
-            for r in range(6):
-                J[i, r] -= T[i] * along[r] / variance
     moments[0] = variance / count
+    if not with_slopes:
+        return count
+    for r in range(6):
+        mean, along = 0.0, 0.0
+        for i in range(count):
+            mean += J[r, i]
+            along += J[r, i] * T[i]
+        mean /= count
+        along /= variance
+        for i in range(count):
+            J[r, i] -= mean + T[i] * along
     return count
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _compare(A, shape, image, samples, count, with_slopes, J, T, b):
-    """Sample the image: right side Σ J̃ I into `b`; returns its covariance with T and its variance."""
+def _compare(A, places, image, count, with_slopes, J, T, b, at, aside, below, values):
+    """Sample the image: right side Σ J̃ I into `b`; returns its covariance with T and its variance.
+
+    In three loops, of which only the middle one reads here and there: `at`, `aside`, `below`, `values` (M,) are its
+    pixels, the fractions of a pixel, and what it found.
+    """
     H, W = image.shape
-    total, square, product = 0.0, 0.0, 0.0
-    b0 = b1 = b2 = b3 = b4 = b5 = 0.0
+    a00, a01, a02, a03 = A[0, 0], A[0, 1], A[0, 2], A[0, 3]
+    a10, a11, a12, a13 = A[1, 0], A[1, 1], A[1, 2], A[1, 3]
+    a20, a21, a22, a23 = A[2, 0], A[2, 1], A[2, 2], A[2, 3]
     for i in range(count):
-        q = samples[i]
-        s, t, z = shape[q, 0], shape[q, 1], shape[q, 2]
-        w = 1.0 / (A[2, 0] * s + A[2, 1] * t + A[2, 2] * z + A[2, 3])
-        x = (A[0, 0] * s + A[0, 1] * t + A[0, 2] * z + A[0, 3]) * w
-        y = (A[1, 0] * s + A[1, 1] * t + A[1, 2] * z + A[1, 3]) * w
+        s, t, z = places[0, i], places[1, i], places[2, i]
+        w = 1.0 / (a20 * s + a21 * t + a22 * z + a23)
+        x = (a00 * s + a01 * t + a02 * z + a03) * w
+        y = (a10 * s + a11 * t + a12 * z + a13) * w
         x = min(max(x, 0.0), W - 1.001)
         y = min(max(y, 0.0), H - 1.001)
-        value = bilinear(image, x, y)
+        column, row = np.int32(x), np.int32(y)
+        at[i] = row * np.int32(W) + column
+        aside[i] = x - column
+        below[i] = y - row
+    pixels = image.reshape(-1)
+    for i in range(count):
+        first = np.uint32(at[i])
+        second = np.uint32(first + np.uint32(W))
+        top = pixels[first] + aside[i] * (pixels[first + np.uint32(1)] - pixels[first])
+        low = pixels[second] + aside[i] * (pixels[second + np.uint32(1)] - pixels[second])
+        values[i] = top + below[i] * (low - top)
+    total, square, product = 0.0, 0.0, 0.0
+    for i in range(count):
+        value = np.float64(values[i])
         total += value
         square += value * value
         product += value * T[i]
-        if not with_slopes:
-            continue
-        b0 += J[i, 0] * value
-        b1 += J[i, 1] * value
-        b2 += J[i, 2] * value
-        b3 += J[i, 3] * value
-        b4 += J[i, 4] * value
-        b5 += J[i, 5] * value
-    b[0], b[1], b[2], b[3], b[4], b[5] = b0, b1, b2, b3, b4, b5
+    if with_slopes:
+        for r in range(6):
+            sum_r = 0.0
+            for i in range(count):
+                sum_r += np.float64(J[r, i]) * values[i]
+            b[r] = sum_r
     return product / count, square / count - (total / count) ** 2
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _align_one(
-    n,
+def _align_some(
+    which,
     X,
     Q,
     shape,
@@ -169,138 +181,146 @@ def _align_one(
     correlation,
     covariance,
 ):
-    """Align patch `n`; parameters as of `align_patches`."""
+    """Align patches `which` one after the other, with the same scratch arrays; parameters as of `align_patches`."""
     M = shape.shape[1]
     C = use.shape[1]
     A = np.empty((C, 3, 4))
-    J = np.zeros((C, M, 6), np.float32)
+    J = np.empty((C, 6, M), np.float32)
     T = np.empty((C, M), np.float32)
-    samples = np.empty((C, M), np.int64)
-    counts = np.zeros(C, np.int64)
-    variance_t = np.zeros(C)
-    H = np.zeros((C, 6, 6))
-    b = np.zeros((C, 6))
-    moments = np.zeros(1)
-    weights = np.zeros(C)
-    gains = np.zeros(C)
+    places = np.empty((C, 3, M))
+    at, aside, below, values = (
+        np.empty(M, np.int32),
+        np.empty(M, np.float32),
+        np.empty(M, np.float32),
+        np.empty(M, np.float32),
+    )
+    counts = np.empty(C, np.int64)
+    variance_t = np.empty(C)
+    H = np.empty((C, 6, 6))
+    b = np.empty((C, 6))
+    moments = np.empty(1)
+    weights, gains, now = np.empty(C), np.empty(C), np.empty(C)
     N6, L6 = np.zeros((6, 6)), np.zeros((6, 6))
-    r6, x6, local = np.zeros(6), np.zeros(6), np.zeros(3)
-    x_n, q_n, q_new = X[n].copy(), Q[n].copy(), np.zeros((3, 3))
-    best_x, best_q, best = x_n.copy(), q_n.copy(), -2.0
-    seen, last = 0, False
-    for c in range(C):
-        correlation[n, c] = -1.0
-        if not use[n, c]:
-            continue
-        local_camera(P[c], x_n, q_n, A[c])
-        for r in range(3):
-            local[r] = 0.0
-            for k in range(3):
-                local[r] += q_n[k, r] * (centers[c, k] - x_n[k])
-        counts[c] = _prepare(
-            A[c],
-            local,
-            shape[n],
-            templates[rows[n], c, level],
-            usable[rows[n], c],
-            masks[c],
-            use_mask,
-            iterations > 0,
-            stride,
-            samples[c],
-            J[c],
-            T[c],
-            moments,
-        )
-        if counts[c] == 0:
-            continue
-        seen += 1
-        variance_t[c] = moments[0]
-        if iterations > 0:
-            for i in range(counts[c]):
+    r6, x6, local = np.empty(6), np.empty(6), np.empty(3)
+    x_n, q_n, q_new = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    best_x, best_q = np.empty(3), np.empty((3, 3))
+    for n in which:
+        set_place(x_n, q_n, X[n], Q[n])
+        set_place(best_x, best_q, x_n, q_n)
+        best = -2.0
+        seen, last, solved = 0, False, False
+        for c in range(C):
+            correlation[n, c] = now[c] = -1.0
+            counts[c] = 0
+            if not use[n, c]:
+                continue
+            local_camera(P[c], x_n, q_n, A[c])
+            for r in range(3):
+                local[r] = 0.0
+                for k in range(3):
+                    local[r] += q_n[k, r] * (centers[c, k] - x_n[k])
+            counts[c] = _prepare(
+                A[c],
+                local,
+                shape[n],
+                templates[rows[n], c, level],
+                usable[rows[n], c],
+                masks[c],
+                use_mask,
+                iterations > 0,
+                stride,
+                places[c],
+                J[c],
+                T[c],
+                moments,
+            )
+            if counts[c] == 0:
+                continue
+            seen += 1
+            variance_t[c] = moments[0]
+            if iterations > 0:
                 for r in range(6):
                     for k in range(r + 1):
-                        H[c, r, k] += J[c, i, r] * J[c, i, k]
-    for r in range(6):
-        covariance[n, r] = np.nan
-    if seen == 0:
-        return
-    now = np.full(C, -1.0)
-    for step in range(iterations + 1):
-        top, score, share = -1.0, 0.0, 0.0
-        for c in range(C):
-            if counts[c] == 0:
-                continue
-            if step > 0:
-                local_camera(P[c], x_n, q_n, A[c])
-            product, variance = _compare(
-                A[c], shape[n], images[c], samples[c], counts[c], iterations > 0, J[c], T[c], b[c]
-            )
-            now[c] = product / math.sqrt(max(variance, 1e-3) * variance_t[c])
-            gains[c] = min(max(product / max(variance, 1e-3), 1 / _GAIN), _GAIN)
-            residual = max(variance_t[c] * (1 - now[c] * abs(now[c])), 0.0)
-            misfit = residual * counts[c] / max(counts[c] - 8, 1)
-            weights[c] = 1 / (misfit * max(COHERENT * counts[c], 1.0) + _FLOOR**2)
-            top = max(top, now[c])
-        for c in range(C):
-            if counts[c] == 0:
-                continue
-            if now[c] < least_correlation and now[c] < top - 0.05:
-                weights[c] = 0.0
-            score += counts[c] * now[c]
-            share += counts[c]
-        score /= share
-        if score > best:
-            best = score
-            set_place(best_x, best_q, x_n, q_n)
-            for c in range(C):
-                correlation[n, c] = now[c]
-        elif step > 2 and score < best - 0.1:
-            break
-        if iterations == 0:
-            break
-        # shared normal equations of all cameras, with the expected place as an observation
+                        sum_rk = 0.0
+                        for i in range(counts[c]):
+                            sum_rk += np.float64(J[c, r, i]) * J[c, k, i]
+                        H[c, r, k] = sum_rk
         for r in range(6):
-            sd = prior_shift[n] if r < 3 else prior_turn[n]
-            r6[r] = 0.0
-            for k in range(r + 1):
-                N6[r, k] = 0.0
+            covariance[n, r] = np.nan
+        if seen == 0:
+            continue
+        for step in range(iterations + 1):
+            top, score, share = -1.0, 0.0, 0.0
             for c in range(C):
                 if counts[c] == 0:
                     continue
+                if step > 0:
+                    local_camera(P[c], x_n, q_n, A[c])
+                product, variance = _compare(
+                    A[c], places[c], images[c], counts[c], iterations > 0, J[c], T[c], b[c], at, aside, below, values
+                )
+                now[c] = product / math.sqrt(max(variance, 1e-3) * variance_t[c])
+                gains[c] = min(max(product / max(variance, 1e-3), 1 / _GAIN), _GAIN)
+                residual = max(variance_t[c] * (1 - now[c] * abs(now[c])), 0.0)
+                misfit = residual * counts[c] / max(counts[c] - 8, 1)
+                weights[c] = 1 / (misfit * max(COHERENT * counts[c], 1.0) + _FLOOR**2)
+                top = max(top, now[c])
+            for c in range(C):
+                if counts[c] == 0:
+                    continue
+                if now[c] < least_correlation and now[c] < top - 0.05:
+                    weights[c] = 0.0
+                score += counts[c] * now[c]
+                share += counts[c]
+            score /= share
+            if score > best:
+                best = score
+                set_place(best_x, best_q, x_n, q_n)
+                for c in range(C):
+                    correlation[n, c] = now[c]
+            elif step > 2 and score < best - 0.1:
+                break
+            if iterations == 0:
+                break
+            # shared normal equations of all cameras, with the expected place as an observation
+            for r in range(6):
+                sd = prior_shift[n] if r < 3 else prior_turn[n]
+                r6[r] = 0.0
                 for k in range(r + 1):
-                    N6[r, k] += weights[c] * H[c, r, k]
-                r6[r] -= weights[c] * gains[c] * b[c, r]
-            if r < 3:
-                away = 0.0
-                for k in range(3):
-                    away += q_n[k, r] * (prior_X[n, k] - x_n[k])
-            else:
-                i, j = (r - 2) % 3, (r - 1) % 3  # ω_r = (R_ji − R_ij) / 2 of R = Qᵀ Q_prior
-                away = 0.0
-                for k in range(3):
-                    away += 0.5 * (q_n[k, j] * prior_Q[n, k, i] - q_n[k, i] * prior_Q[n, k, j])
-            N6[r, r] += 1 / (sd * sd)
-            r6[r] += away / (sd * sd)
-        if not solve_normal(N6, r6, L6, x6):
-            break
-        if last or step == iterations:
-            break
-        shift = math.sqrt(x6[0] ** 2 + x6[1] ** 2 + x6[2] ** 2)
-        turn = math.sqrt(x6[3] ** 2 + x6[4] ** 2 + x6[5] ** 2)
-        scale = min(1.0, 4 * size[n] / max(shift, 1e-12), 0.3 / max(turn, 1e-12))
-        for r in range(3):
-            x_n[r] += scale * (q_n[r, 0] * x6[0] + q_n[r, 1] * x6[1] + q_n[r, 2] * x6[2])
-        turn_by(q_n, scale * x6[3], scale * x6[4], scale * x6[5], q_new)
-        set_place(x_n, q_n, x_n, q_new)
-        last = shift < 0.01 * size[n] and turn < 1e-3
-    set_place(X[n], Q[n], best_x, best_q)
-    if iterations > 0 and L6[5, 5] > 0:
-        for r in range(6):
-            for k in range(6):
-                r6[k] = 1.0 if k == r else 0.0
-            if solve_normal(N6, r6, L6, x6):
-                covariance[n, r] = x6[r]
+                    N6[r, k] = 0.0
+                for c in range(C):
+                    if counts[c] == 0:
+                        continue
+                    for k in range(r + 1):
+                        N6[r, k] += weights[c] * H[c, r, k]
+                    r6[r] -= weights[c] * gains[c] * b[c, r]
+                if r < 3:
+                    away = 0.0
+                    for k in range(3):
+                        away += q_n[k, r] * (prior_X[n, k] - x_n[k])
+                else:
+                    i, j = (r - 2) % 3, (r - 1) % 3  # ω_r = (R_ji − R_ij) / 2 of R = Qᵀ Q_prior
+                    away = 0.0
+                    for k in range(3):
+                        away += 0.5 * (q_n[k, j] * prior_Q[n, k, i] - q_n[k, i] * prior_Q[n, k, j])
+                N6[r, r] += 1 / (sd * sd)
+                r6[r] += away / (sd * sd)
+            solved = solve_normal(N6, r6, L6, x6)
+            if not solved:
+                break
+            if last or step == iterations:
+                break
+            shift = math.sqrt(x6[0] ** 2 + x6[1] ** 2 + x6[2] ** 2)
+            turn = math.sqrt(x6[3] ** 2 + x6[4] ** 2 + x6[5] ** 2)
+            scale = min(1.0, 4 * size[n] / max(shift, 1e-12), 0.3 / max(turn, 1e-12))
+            for r in range(3):
+                x_n[r] += scale * (q_n[r, 0] * x6[0] + q_n[r, 1] * x6[1] + q_n[r, 2] * x6[2])
+            turn_by(q_n, scale * x6[3], scale * x6[4], scale * x6[5], q_new)
+            set_place(x_n, q_n, x_n, q_new)
+            last = shift < 0.01 * size[n] and turn < 1e-3
+        set_place(X[n], Q[n], best_x, best_q)
+        if solved:
+            inverse_diagonal(L6, covariance[n])
 
 
 @njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
@@ -369,9 +389,9 @@ def align_patches(
     covariance : (N, 6) float
         Filled: variances of shift (m²) and turn (rad²) along the patch's own axes; NaN without solution.
     """
-    for a in prange(len(which)):
-        _align_one(
-            which[a],
+    for block in prange((len(which) + _TOGETHER - 1) // _TOGETHER):
+        _align_some(
+            which[block * _TOGETHER : (block + 1) * _TOGETHER],
             X,
             Q,
             shape,

@@ -72,6 +72,20 @@ def solve_normal(N, b, L, x):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
+def inverse_diagonal(L, out):
+    """Diagonal of (L Lᵀ)⁻¹, with L (6, 6) lower triangular, into `out` (6,): the squares of L⁻¹ summed over rows."""
+    column = np.empty(6)
+    for r in range(6):
+        out[r] = 0.0
+        for i in range(r, 6):
+            s = 1.0 if i == r else 0.0
+            for k in range(r, i):
+                s -= L[i, k] * column[k]
+            column[i] = s / L[i, i]
+            out[r] += column[i] * column[i]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
 def turn_by(Q, w0, w1, w2, out):
     """Q · exp([w]×) into `out`."""
     angle = math.sqrt(w0 * w0 + w1 * w1 + w2 * w2)

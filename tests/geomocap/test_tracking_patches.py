@@ -12,6 +12,7 @@ from geomocap.geometry import Voxels
 from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.patch_kernel import align_patches
 from geomocap.tracking.patch_search import renewed
+from geomocap.tracking.patch_templates import inverse_diagonal
 from geomocap.tracking.patch_tracking import track_surface
 from geomocap.tracking.patches import Patches, align, doubted, with_templates
 from geomocap.tracking.seeding import (
@@ -341,3 +342,11 @@ def test_patches_can_be_selected_and_joined(seeds):
 
 def test_kernel_is_compiled_once_for_all(seeds):
     assert len(align_patches.signatures) == 1
+
+
+def test_variances_are_the_diagonal_of_the_inverse():
+    design = np.random.default_rng(5).normal(size=(20, 6))
+    normal = design.T @ design
+    variances = np.empty(6)
+    inverse_diagonal(np.linalg.cholesky(normal), variances)
+    assert_allclose(variances, np.diag(np.linalg.inv(normal)), rtol=1e-12)
