@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 
 from geomocap.carving.grid import Grid
 from geomocap.carving.views import PinholeViews
@@ -122,10 +123,9 @@ class FrameViews:
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project world points (N, 3): array indices x, y (N, C, 2) and depths (N, C), metres."""
-        image = np.einsum("cij,nj->nci", self.projections[:, :, :3], points) + self.projections[:, :, 3]
-        depth = image[:, :, 2]
-        safe = np.where(depth > 0, depth, np.nan)
-        return image[:, :, :2] / safe[:, :, None], depth
+        pixel, depth = np.empty((len(points), self.count, 2)), np.empty((len(points), self.count))
+        _project(self.projections, np.asarray(points, np.float64), pixel, depth)
+        return pixel, depth
 
     def pixel_size(self, points: np.ndarray) -> np.ndarray:
         """Return the length that one pixel covers at world points (N, 3) in each camera: (N, C) float, metres."""
@@ -139,23 +139,42 @@ class FrameViews:
         Both are (N, C) float, metres; that of the surface is NaN where none is seen.
         """
         pixel, depth = self.project(points)
-        inside, row, column = self._array_indices(pixel)
-        found = self.depth[np.arange(self.count), row, column].astype(np.float64)
-        return depth, np.where(inside & np.isfinite(found), found, np.nan)
+        surface = np.empty(depth.shape)
+        _look_up(pixel, self.depth, surface)
+        return depth, surface
 
     def may_be_subject(self, points: np.ndarray) -> np.ndarray:
         """Whether world points (N, 3) lie in the silhouettes of all cameras that see them, or close by: (N,) bool."""
-        inside, row, column = self._array_indices(self.project(points)[0])
-        return ((self.allowed[np.arange(self.count), row, column] != 0) | ~inside).all(axis=1)
+        allowed = np.empty((len(points), self.count))
+        _look_up(self.project(points)[0], self.allowed, allowed)
+        return (allowed != 0).all(axis=1)
 
-    def _array_indices(self, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Whether pixels (N, C, 2) are in the images, and their rows and columns, all (N, C)."""
-        _, H, W = self.masks.shape
-        inside = np.isfinite(pixel).all(axis=2)
-        column = np.rint(np.where(inside, pixel[:, :, 0], -1)).clip(-1, W).astype(np.int64)
-        row = np.rint(np.where(inside, pixel[:, :, 1], -1)).clip(-1, H).astype(np.int64)
-        inside &= (column >= 0) & (row >= 0) & (column < W) & (row < H)
-        return inside, row.clip(0, H - 1), column.clip(0, W - 1)
+
+@njit(cache=True, nogil=True)
+def _project(P: np.ndarray, points: np.ndarray, pixel: np.ndarray, depth: np.ndarray) -> None:
+    """Project points (N, 3) with P (C, 3, 4) into `pixel` (N, C, 2), NaN behind a camera, and `depth` (N, C)."""
+    for n in range(len(points)):
+        x, y, z = points[n]
+        for c in range(len(P)):
+            w = P[c, 2, 0] * x + P[c, 2, 1] * y + P[c, 2, 2] * z + P[c, 2, 3]
+            depth[n, c] = w
+            for i in range(2):
+                v = P[c, i, 0] * x + P[c, i, 1] * y + P[c, i, 2] * z + P[c, i, 3]
+                pixel[n, c, i] = v / w if w > 0 else np.nan
+
+
+@njit(cache=True, nogil=True)
+def _look_up(pixel: np.ndarray, images: np.ndarray, values: np.ndarray) -> None:
+    """Read images (C, H, W) at the nearest of their pixels into `values` (N, C); NaN outside and where infinite."""
+    C, H, W = images.shape
+    for n in range(len(pixel)):
+        for c in range(C):
+            values[n, c] = np.nan
+            x, y = pixel[n, c, 0], pixel[n, c, 1]
+            if x >= -0.5 and y >= -0.5 and x <= W and y <= H:
+                column, row = int(np.rint(x)), int(np.rint(y))
+                if column < W and row < H and np.isfinite(images[c, row, column]):
+                    values[n, c] = images[c, row, column]
 
 
 def _reduced(views: PinholeViews, images: np.ndarray, factor: int) -> tuple[PinholeViews, np.ndarray]:

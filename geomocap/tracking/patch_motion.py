@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numba import njit
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -54,27 +55,60 @@ def image_flow(previous: FrameViews, view: FrameViews, positions: np.ndarray, se
 
 def lift_flow(view: FrameViews, positions: np.ndarray, flow: np.ndarray, neighbours: int = 8) -> np.ndarray:
     """Find the shifts in space (N, 3), metres, that explain image flow (N, C, 2), robustly, median over neighbours."""
-    P = view.projections
     pixel, depth = view.project(positions)
-    # ∂(x, y)/∂X = (p_xy − xy p_z) / depth
-    slope = (P[None, :, :2, :3] - pixel[..., None] * P[None, :, 2:, :3]) / depth[:, :, None, None]
-    known = np.isfinite(flow).all(axis=2) & np.isfinite(slope).all(axis=(2, 3))
-    slope, value = np.where(known[..., None, None], slope, 0.0), np.where(known[..., None], flow, 0.0)
-    weight = known.astype(float)
-    shift = np.zeros_like(positions)
-    flat = slope.reshape(len(slope), -1, 3)
-    for _ in range(4):
-        weighted = flat * np.repeat(weight, 2, axis=1)[:, :, None]
-        N = np.swapaxes(weighted, 1, 2) @ flat + np.eye(3) / _WEAK**2
-        b = np.swapaxes(weighted, 1, 2) @ value.reshape(len(value), -1, 1)
-        shift = np.linalg.solve(N, b)[:, :, 0]
-        residual = np.linalg.norm(value - (flat @ shift[:, :, None]).reshape(value.shape), axis=2)
-        weight = known / (1 + (residual / _FLOW_SIGMA) ** 2)
+    known = np.isfinite(flow).all(axis=2) & (depth > 0)
+    shift = np.empty_like(positions)
+    _lift(view.projections, pixel, depth, flow, known, shift)
     enough = np.flatnonzero(known.sum(axis=1) >= 2)
     if len(enough) < neighbours:
         return shift
     near = cKDTree(positions[enough]).query(positions, neighbours)[1]
     return np.median(shift[enough[near]], axis=1)
+
+
+@njit(cache=True, nogil=True)
+def _lift(P, pixel, depth, flow, known, shift):
+    """Fill `shift` (N, 3) with what explains the `known` (N, C) image flow (N, C, 2) of points at `pixel`, `depth`.
+
+    Least squares, each camera weighted with its residual in four rounds.
+    """
+    slope = np.empty((len(P), 2, 3))  # ∂(x, y)/∂X = (p_xy − xy p_z) / depth
+    weight = np.empty(len(P))
+    for n in range(len(known)):
+        for c in range(len(P)):
+            weight[c] = 1.0 if known[n, c] else 0.0
+            if known[n, c]:
+                for r in range(2):
+                    for k in range(3):
+                        slope[c, r, k] = (P[c, r, k] - pixel[n, c, r] * P[c, 2, k]) / depth[n, c]
+        for _ in range(4):
+            a = b = d = 1.0 / _WEAK**2
+            e = f = g = u = v = w = 0.0
+            for c in range(len(P)):
+                if not known[n, c]:
+                    continue
+                for r in range(2):
+                    x, y, z = slope[c, r, 0], slope[c, r, 1], slope[c, r, 2]
+                    m = weight[c]
+                    a, b, d = a + m * x * x, b + m * y * y, d + m * z * z
+                    e, f, g = e + m * x * y, f + m * x * z, g + m * y * z
+                    m *= flow[n, c, r]
+                    u, v, w = u + m * x, v + m * y, w + m * z
+            # [[a e f] [e b g] [f g d]] · shift = (u, v, w), by cofactors
+            p, q, s = b * d - g * g, f * g - e * d, e * g - b * f
+            determinant = a * p + e * q + f * s
+            shift[n, 0] = (p * u + q * v + s * w) / determinant
+            shift[n, 1] = (q * u + (a * d - f * f) * v + (e * f - a * g) * w) / determinant
+            shift[n, 2] = (s * u + (e * f - a * g) * v + (a * b - e * e) * w) / determinant
+            for c in range(len(P)):
+                if known[n, c]:
+                    square = 0.0
+                    for r in range(2):
+                        miss = flow[n, c, r]
+                        for k in range(3):
+                            miss -= slope[c, r, k] * shift[n, k]
+                        square += miss * miss
+                    weight[c] = 1.0 / (1.0 + square / _FLOW_SIGMA**2)
 
 
 def carried(

@@ -212,7 +212,7 @@ def new_views(patches: Patches, found: Alignment, good: np.ndarray, view: FrameV
     sure = good & (found.correlation > _NEW_TEMPLATE_CORRELATION) & (found.n_views >= 2)
     slack = hiding_depth(patches, view, 0.5 * slack_px)
     cosine = facings(patches.positions, patches.normals, view)
-    want = visible(patches, patches.positions, patches.frames, view, slack, _FACING) & ~patches.has
+    want = visible(patches.positions, patches.frames, patches.hidden, view, slack, _FACING) & ~patches.has
     want &= (cosine > _NEW_TEMPLATE_FACING) & sure[:, None]
     return with_templates(patches, want, view, found.image_sigma) if want.any() else patches
 
@@ -278,10 +278,10 @@ def _asked(
     settings: TrackingSettings,
 ) -> np.ndarray:
     """Cameras with a template that see patches `which` at given places, (N, C) bool."""
-    some = patches.select(which)
-    slack = hiding_depth(some, view, settings.slack_px)
+    slack = hiding_depth(patches, view, settings.slack_px)[which]
     use = np.zeros(patches.has.shape, bool)
-    use[which] = visible(some, positions[which], frames[which], view, slack, _FACING) & some.has
+    seen = visible(positions[which], frames[which], patches.hidden[which], view, slack, _FACING)
+    use[which] = seen & patches.has[which]
     return use
 
 

@@ -148,7 +148,10 @@ class Patches:
         parts = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _OWN}
         parts["rows"] = np.arange(len(self) + len(other))
         for name in ("templates", "usable"):
-            parts[name] = np.concatenate([getattr(self, name)[self.rows], getattr(other, name)[other.rows]])
+            mine, new = getattr(self, name), getattr(other, name)
+            parts[name] = both = np.empty((len(self) + len(other), *mine.shape[1:]), mine.dtype)
+            np.take(mine, self.rows, axis=0, out=both[: len(self)], mode="clip")  # "raise" would copy once more
+            np.take(new, other.rows, axis=0, out=both[len(self) :], mode="clip")
         return Patches(**parts)
 
     def moved(self, positions: np.ndarray, frames: np.ndarray) -> Patches:
@@ -162,7 +165,7 @@ class Patches:
 
 
 def visible(
-    patches: Patches, positions: np.ndarray, frames: np.ndarray, view: FrameViews, slack: np.ndarray, facing: float
+    positions: np.ndarray, frames: np.ndarray, hidden: np.ndarray, view: FrameViews, slack: np.ndarray, facing: float
 ) -> np.ndarray:
     """Find which cameras see patches at given places: (N, C) bool.
 
@@ -171,8 +174,9 @@ def visible(
 
     Parameters
     ----------
-    patches : Patches
     positions, frames : (N, 3), (N, 3, 3) float
+    hidden : (N, C) float
+        How far behind the surface they were then, see `Patches`.
     view : FrameViews
     slack : (N, 1) float, metres
     facing : float
@@ -180,7 +184,7 @@ def visible(
     """
     depth, surface = view.depths(positions)
     return (facings(positions, frames[:, :, 2], view) > facing) & (
-        depth - surface - np.nan_to_num(np.maximum(patches.hidden, 0.0)) < slack
+        depth - surface - np.nan_to_num(np.maximum(hidden, 0.0)) < slack
     )
 
 

@@ -41,7 +41,7 @@ def reacquire(
     agree : (N, C) bool
         Cameras in which it was found.
     """
-    use = visible(patches, patches.positions, patches.frames, view, slack, _FACING)
+    use = visible(patches.positions, patches.frames, patches.hidden, view, slack, _FACING)
     which = np.flatnonzero(lost & (use.sum(axis=1) >= settings.n_views) & patches.has.any(axis=1))
     some, seen = patches.select(which), use[which]
     rows, C = np.arange(len(which)), view.count

@@ -35,7 +35,9 @@ def benchmark() -> list[Row]:
     placing = time.perf_counter() - start
     slack = SETTINGS.slack_px * seeds.size[:, None]
     start = time.perf_counter()
-    theirs = _lucas_kanade(frames, seeds.positions, lambda X, view: visible(seeds, X, seeds.frames, view, slack, 0.25))
+    theirs = _lucas_kanade(
+        frames, seeds.positions, lambda X, view: visible(X, seeds.frames, seeds.hidden, view, slack, 0.25)
+    )
     competitor = time.perf_counter() - start
     seconds = total - placing
     points = int(tracks.measured.sum())

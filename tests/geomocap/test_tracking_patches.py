@@ -11,6 +11,7 @@ from geomocap.errors import GeometryError
 from geomocap.geometry import Voxels
 from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.patch_kernel import align_patches
+from geomocap.tracking.patch_motion import lift_flow
 from geomocap.tracking.patch_search import renewed
 from geomocap.tracking.patch_templates import inverse_diagonal
 from geomocap.tracking.patch_tracking import track_surface
@@ -350,3 +351,36 @@ def test_variances_are_the_diagonal_of_the_inverse():
     variances = np.empty(6)
     inverse_diagonal(np.linalg.cholesky(normal), variances)
     assert_allclose(variances, np.diag(np.linalg.inv(normal)), rtol=1e-12)
+
+
+def _lifted_by_numpy(view, positions, flow):
+    P = view.projections
+    pixel, depth = view.project(positions)
+    slope = (P[None, :, :2, :3] - pixel[..., None] * P[None, :, 2:, :3]) / depth[:, :, None, None]
+    known = np.isfinite(flow).all(axis=2)
+    weight, flow, shifts = known.astype(float), np.where(known[..., None], flow, 0.0), []
+    for n in range(len(positions)):
+        rows, values = slope[n].reshape(-1, 3), flow[n].reshape(-1)
+        for _ in range(4):
+            weights = np.repeat(weight[n], 2)
+            shift = np.linalg.solve(
+                (rows * weights[:, None]).T @ rows + np.eye(3) / 0.3**2, (rows * weights[:, None]).T @ values
+            )
+            miss = np.linalg.norm((values - rows @ shift).reshape(-1, 2), axis=1)
+            weight[n] = known[n] / (1 + (miss / 1.5) ** 2)
+        shifts.append(shift)
+    return np.array(shifts)
+
+
+def test_lifted_flow_is_that_of_numpy(views):
+    view = views[0]
+    rng = np.random.default_rng(6)
+    positions = view.surface[rng.choice(len(view.surface), 40, replace=False)]
+    true = 0.02 * rng.normal(size=positions.shape)
+    flow = view.project(positions + true)[0] - view.project(positions)[0]
+    flow[rng.random(flow.shape[:2]) < 0.2] = np.nan
+    flow[3, 0] += 20.0
+    # the median over the patches that follow is that of each patch alone if all have the same place
+    for n in range(0, 40, 8):
+        found = lift_flow(view, np.repeat(positions[n : n + 1], 9, axis=0), np.repeat(flow[n : n + 1], 9, axis=0))
+        assert_allclose(found[0], _lifted_by_numpy(view, positions[n : n + 1], flow[n : n + 1])[0], atol=1e-9)
