@@ -38,9 +38,9 @@ def track_surface(
 ) -> Trajectories:
     """Follow the surface of the subject through all frames.
 
-    Patches are placed on the first frame's surface and, every `seed_every` frames, wherever the surface has none. All
-    are followed forward; then those placed later backward to the first frame, until they have run for some frames
-    beside an older one, with which they are joined. Frames come in order and two are held.
+    Patches are placed on the first frame's surface and, every `seed_every` frames and in the last one, wherever the
+    surface has none. All are followed forward; then those placed later backward to the first frame, until they have
+    run for some frames beside an older one, with which they are joined. Frames come in order and two are held.
     Where the cameras are so few that two of them agree on less than a part (`one_camera_below`) of the first frame's
     surface, the rest gets patches of single cameras. Their depth is that of the volume, adjusted to the motion of what
     is around them.
@@ -77,7 +77,7 @@ def track_surface(
             settings = settings.model_copy(update={"radius_px": patch_radius(view, spacing, settings)})
         elif previous is not None:
             state = _next(state, previous, view, settings, record, k, spacing, forward=True)
-        if k % settings.seed_every == 0:
+        if k % settings.seed_every == 0 or k == n_frames - 1:
             several, one = _taken(state)
             patches = seed_patches(view, several, spacing, settings, rng)
             if state is None:

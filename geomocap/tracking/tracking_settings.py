@@ -36,7 +36,9 @@ class TrackingSettings(Settings):
         "updated",
         description="Template: the first view of a camera, a new one where it fits badly, or the last frame's",
     )
-    seed_every: int = Field(10, ge=1, description="Frames between two looks for surface without patches")
+    seed_every: int = Field(
+        10, ge=1, description="Frames between two looks for surface without patches; the last frame is looked at too"
+    )
     seed_correlation: float = Field(0.85, gt=0, lt=1, description="Least correlation between cameras for a new patch")
     search_front: float = Field(0.015, ge=0, description="How far before the surface a new patch is looked for (m)")
     search_depth: float = Field(0.06, ge=0, description="How far behind the surface a new patch is looked for (m)")

@@ -327,6 +327,15 @@ def test_a_patch_is_known_no_better_than_when_its_templates_were_taken(scene, vi
     assert_allclose(both.sigma[fresh], np.hypot(again.sigma, found.sigma)[fresh])
 
 
+def test_surface_without_patches_gets_some_in_the_last_frame_too(views):
+    first = views[0].surface[:, 0] < np.median(views[0].surface[:, 0])  # the rest of the surface is not there yet
+    half = replace(views[0], surface=views[0].surface[first])
+    tracks = track_surface(lambda k: views[k] if k else half, 3, SETTINGS)
+    late = tracks.placed == 2
+    assert late.sum() > 20
+    assert tracks.measured[late, 1].mean() > 0.5
+
+
 def test_tracking_repeats_bit_for_bit(views):
     few = SETTINGS.model_copy(update={"n_patches": 40})
     first, second = (track_surface(lambda k: views[k], 3, few) for _ in range(2))
