@@ -362,6 +362,30 @@ def test_variances_are_the_diagonal_of_the_inverse():
     assert_allclose(variances, np.diag(np.linalg.inv(normal)), rtol=1e-12)
 
 
+def test_projections_and_surface_depths_are_those_of_numpy(views):
+    view = views[0]
+    rng = np.random.default_rng(7)
+    points = np.concatenate([view.surface[::5], rng.normal(scale=4.0, size=(200, 3))])  # behind and beside cameras too
+    image = np.einsum("cij,nj->nci", view.projections[:, :, :3], points) + view.projections[:, :, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        true = np.where(image[:, :, 2:] > 0, image[:, :, :2] / image[:, :, 2:], np.nan)
+    pixel, depth = view.project(points)
+    assert_allclose(pixel, true, rtol=1e-9, atol=1e-9)
+    assert_allclose(depth, image[:, :, 2], atol=1e-12)
+    _, H, W = view.masks.shape
+    surface = np.full(depth.shape, np.nan)
+    allowed = np.ones(len(points), bool)
+    for n, c in np.ndindex(depth.shape):
+        if np.isfinite(true[n, c]).all():
+            x, y = np.rint(true[n, c]).astype(int)
+            if 0 <= x < W and 0 <= y < H:
+                surface[n, c] = view.depth[c, y, x]
+                allowed[n] &= view.allowed[c, y, x] != 0
+    assert np.isfinite(surface).any() and not allowed.all() and np.isnan(true).any()
+    assert_allclose(view.depths(points)[1], np.where(np.isfinite(surface), surface, np.nan))
+    assert np.array_equal(view.may_be_subject(points), allowed)
+
+
 def _lifted_by_numpy(view, positions, flow):
     P = view.projections
     pixel, depth = view.project(positions)
@@ -388,7 +412,7 @@ def test_lifted_flow_is_that_of_numpy(views):
     true = 0.02 * rng.normal(size=positions.shape)
     flow = view.project(positions + true)[0] - view.project(positions)[0]
     flow[rng.random(flow.shape[:2]) < 0.2] = np.nan
-    flow[3, 0] += 20.0
+    flow[8, 0] += 20.0  # a camera that follows something else
     # the median over the patches that follow is that of each patch alone if all have the same place
     for n in range(0, 40, 8):
         found = lift_flow(view, np.repeat(positions[n : n + 1], 9, axis=0), np.repeat(flow[n : n + 1], 9, axis=0))
