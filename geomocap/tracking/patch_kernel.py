@@ -26,8 +26,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from geomocap.matching.spline import FAST
-from geomocap.tracking.patch_samples import choose_samples, compare
+from geomocap.tracking.patch_samples import choose_samples, compare, sum_of_products
 from geomocap.tracking.patch_templates import inverse_diagonal, local_camera, set_place, solve_normal, turn_by
 
 _FLOOR = 2.0  # noise of an image that even a perfect fit is granted, grey levels
@@ -36,7 +35,7 @@ _TOGETHER = 32  # patches of a thread before it asks for more
 _GAIN = 3.0  # most contrast that an image may lose or win against the template
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _align_some(
     which,
     X,
@@ -123,10 +122,7 @@ def _align_some(
             if iterations > 0:
                 for r in range(6):
                     for k in range(r + 1):
-                        sum_rk = 0.0
-                        for i in range(counts[c]):
-                            sum_rk += np.float64(J[c, r, i]) * J[c, k, i]
-                        H[c, r, k] = sum_rk
+                        H[c, r, k] = sum_of_products(J[c, r], J[c, k], counts[c])
         for r in range(6):
             covariance[n, r] = np.nan
         if seen == 0:
@@ -205,7 +201,7 @@ def _align_some(
             inverse_diagonal(L6, covariance[n])
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
+@njit(cache=True, nogil=True, parallel=True)
 def align_patches(
     which,
     X,

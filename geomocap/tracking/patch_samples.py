@@ -1,4 +1,9 @@
-"""The samples of a patch in one camera: which are seen there, their Jacobian, and what the image shows at them."""
+"""The samples of a patch in one camera: which are seen there, their Jacobian, and what the image shows at them.
+
+Only the sums over samples may be reordered by the compiler: code that was just compiled and the same code from the
+cache need not agree in the last bits where it chooses the order of operations, and a first run would differ from later
+ones.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +16,7 @@ from geomocap.tracking.patch_templates import LEAST_SAMPLES, LEAST_VARIANCE
 _LEAST_FACING = 0.2  # cosine between normal and viewing ray below which a sample is not used
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def choose_samples(A, center, shape, template, usable, mask, use_mask, with_slopes, stride, places, J, T, moments):
     """Choose the samples of one camera and form their Jacobian, free of offset and gain.
 
@@ -54,28 +59,23 @@ def choose_samples(A, center, shape, template, usable, mask, use_mask, with_slop
     if count < LEAST_SAMPLES * offered or count < 12:
         return 0
     mean_t /= count
-    variance = 0.0
     for i in range(count):
         T[i] -= mean_t
-        variance += T[i] * T[i]
+    variance = sum_of_products(T, T, count)
     if variance < LEAST_VARIANCE * count:
         return 0
     moments[0] = variance / count
     if not with_slopes:
         return count
     for r in range(6):
-        mean, along = 0.0, 0.0
-        for i in range(count):
-            mean += J[r, i]
-            along += J[r, i] * T[i]
-        mean /= count
-        along /= variance
+        mean = sum_of(J[r], count) / count
+        along = sum_of_products(J[r], T, count) / variance
         for i in range(count):
             J[r, i] -= mean + T[i] * along
     return count
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def compare(A, places, image, count, with_slopes, J, T, b, at, aside, below, values):
     """Sample the image: right side Σ J̃ I into `b`; returns its covariance with T and its variance.
 
@@ -104,16 +104,27 @@ def compare(A, places, image, count, with_slopes, J, T, b, at, aside, below, val
         top = pixels[first] + aside[i] * (pixels[first + np.uint32(1)] - pixels[first])
         low = pixels[second] + aside[i] * (pixels[second + np.uint32(1)] - pixels[second])
         values[i] = top + below[i] * (low - top)
-    total, square, product = 0.0, 0.0, 0.0
-    for i in range(count):
-        value = np.float64(values[i])
-        total += value
-        square += value * value
-        product += value * T[i]
+    total, square = sum_of(values, count), sum_of_products(values, values, count)
+    product = sum_of_products(values, T, count)
     if with_slopes:
         for r in range(6):
-            sum_r = 0.0
-            for i in range(count):
-                sum_r += np.float64(J[r, i]) * values[i]
-            b[r] = sum_r
+            b[r] = sum_of_products(J[r], values, count)
     return product / count, square / count - (total / count) ** 2
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def sum_of(a, count):
+    """Sum of the first `count` of `a` (S,) float32, in double precision."""
+    total = 0.0
+    for i in range(count):
+        total += np.float64(a[i])
+    return total
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def sum_of_products(a, b, count):
+    """Sum of the first `count` products of `a` and `b` (S,) float32, in double precision."""
+    total = 0.0
+    for i in range(count):
+        total += np.float64(a[i]) * np.float64(b[i])
+    return total

@@ -7,7 +7,6 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from geomocap.matching.spline import FAST
 
 LEAST_SAMPLES = 0.6
 """Share of a template's samples that a camera must show for it to count."""
@@ -16,7 +15,7 @@ LEAST_VARIANCE = 4.0
 """Least variance of the grey levels under a patch."""
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+@njit(cache=True, nogil=True, inline="always")
 def bilinear(image, x, y):
     """Interpolate an image at array indices x, y that must lie inside."""
     i, j = int(x), int(y)
@@ -26,7 +25,7 @@ def bilinear(image, x, y):
     return top * (1 - b) + low * b
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def local_camera(P, X, Q, A):
     """Projection of the patch's own coordinates: P [Q X; 0 1] into `A` (3, 4)."""
     for i in range(3):
@@ -35,7 +34,7 @@ def local_camera(P, X, Q, A):
         A[i, 3] = P[i, 0] * X[0] + P[i, 1] * X[1] + P[i, 2] * X[2] + P[i, 3]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def set_place(X, Q, new_X, new_Q):
     """Overwrite X (3,) and Q (3, 3)."""
     for i in range(3):
@@ -44,7 +43,7 @@ def set_place(X, Q, new_X, new_Q):
             Q[i, j] = new_Q[i, j]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def solve_normal(N, b, L, x):
     """Solve N x = b with N (6, 6) symmetric, lower triangle given; returns whether it is positive definite."""
     for i in range(6):
@@ -71,7 +70,7 @@ def solve_normal(N, b, L, x):
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def inverse_diagonal(L, out):
     """Diagonal of (L Lᵀ)⁻¹, with L (6, 6) lower triangular, into `out` (6,): the squares of L⁻¹ summed over rows."""
     column = np.empty(6)
@@ -85,7 +84,7 @@ def inverse_diagonal(L, out):
             out[r] += column[i] * column[i]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def turn_by(Q, w0, w1, w2, out):
     """Q · exp([w]×) into `out`."""
     angle = math.sqrt(w0 * w0 + w1 * w1 + w2 * w2)
@@ -104,7 +103,7 @@ def turn_by(Q, w0, w1, w2, out):
         out[i, 2] = q0 * e02 + q1 * e12 + q2 * e22
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
+@njit(cache=True, nogil=True, parallel=True)
 def take_templates(X, Q, shape, rows, want, levels, masks, P, templates, usable):
     """Take templates of patches in the cameras where `want` is 1.
 
