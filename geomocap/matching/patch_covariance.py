@@ -6,12 +6,12 @@ import math
 
 from numba import njit
 
-from geomocap.matching.spline import FAST, NOISE_SLOPE, NOISE_VALUE
+from geomocap.matching.spline import NOISE_SLOPE, NOISE_VALUE
 
 _TWO_PI = 2 * math.pi
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def cholesky(H, L):
     """Factorise a 6×6 matrix; False if it is not positive definite."""
     for i in range(6):
@@ -28,7 +28,7 @@ def cholesky(H, L):
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def solve(L, b, x):
     """Solve L Lᵀ x = b."""
     for i in range(6):
@@ -43,7 +43,7 @@ def solve(L, b, x):
         x[i] = s / L[i, i]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def noise_kept(order, x, y, a11, a12, a21, a22, radius):
     """Share of white noise that spline values of a warped patch keep on average (product of two `NOISE_VALUE`).
 
@@ -63,7 +63,7 @@ def noise_kept(order, x, y, a11, a12, a21, a22, radius):
     return a0 * a0 + a0 * a1 * (cx + cy) + a1 * a1 * product
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _dirichlet(u, n):
     u -= math.floor(u + 0.5)
     s = math.sin(math.pi * u)
@@ -72,7 +72,7 @@ def _dirichlet(u, n):
     return math.sin(math.pi * n * u) / (n * s)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def covariance(order, ox, oy, radius, H, moments, s2, px, py, warp, M, v, out):
     """A-posteriori covariance of a position in the search image, with noise in both images.
 

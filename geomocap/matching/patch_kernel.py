@@ -14,7 +14,6 @@ from numba import njit
 
 from geomocap.matching.patch_covariance import cholesky, covariance, solve
 from geomocap.matching.patch_sums import normal_equations, sample_and_project, sample_template, template_mask
-from geomocap.matching.spline import FAST
 
 MATCHED = 0
 OUTSIDE_TEMPLATE = 1
@@ -54,7 +53,7 @@ def workspace(radius, images):
     )
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def transfer(T, mu, x, y, out):
     """Where the template point (x, y) at inverse depth `mu` is seen, and its derivative by `mu`, into out[0:4]."""
     p0 = T[0] * x + T[1] * y + T[2]
@@ -70,7 +69,7 @@ def transfer(T, mu, x, y, out):
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def inverse_depth(transfers, x, y, position, use):
     """Inverse depth whose projections lie nearest to the positions in the images in use (algebraic least squares)."""
     num = den = 0.0
@@ -89,7 +88,7 @@ def inverse_depth(transfers, x, y, position, use):
     return num / den if den > 0 else 0.0
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def match_patch(
     flat,
     masks,
@@ -326,7 +325,7 @@ def _nearest(layout, x, y):
     return layout[0] + iy * layout[1] + ix
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _compose(position, A, d):
     """Replace the warp W(p) by W(p) ∘ W(d)⁻¹; False if it can't be."""
     d11 = 1.0 + d[1]

@@ -11,10 +11,9 @@ import numpy as np
 from numba import njit
 
 from geomocap.matching.grow_kernel import plane_start
-from geomocap.matching.spline import FAST
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _correlate(flat, start, height, width, f, offsets, variance, position, affine, radius):
     """Normalised correlation of the centred template samples `f` at `offsets` with an image under a warp, bilinear."""
     ex = (abs(affine[0]) + abs(affine[1])) * radius
@@ -45,7 +44,7 @@ def _correlate(flat, start, height, width, f, offsets, variance, position, affin
     return sf / math.sqrt(spread * variance)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def on_plane(scene, x, y, plane, patch, work, only):
     """Mean correlation with the template patch laid on a plane, of all images or `only` one; each into `each`.
 

@@ -17,8 +17,12 @@ from scipy import ndimage
 PAD = 4
 """Coefficients kept beyond each border, pixels; the quintic needs three."""
 
-FAST = {"reassoc", "contract", "arcp", "nsz"}
-"""Liberties that the compiler may take with sums; NaN and infinity keep their meaning."""
+FAST = {"reassoc", "nsz"}
+"""What the compiler may do with sums: add in another order, but not round otherwise.
+
+Code that was just compiled and the same code from the cache are optimised differently; were they free to fuse
+multiplications with additions, a first run would differ from later ones in the last bits.
+"""
 
 _F4 = np.float32
 _SIXTH = _F4(1 / 6)

@@ -1,9 +1,4 @@
-"""The samples of a patch in one camera: which are seen there, their Jacobian, and what the image shows at them.
-
-Only the sums over samples may be reordered by the compiler: code that was just compiled and the same code from the
-cache need not agree in the last bits where it chooses the order of operations, and a first run would differ from later
-ones.
-"""
+"""The samples of a patch in one camera: which are seen there, their Jacobian, and what the image shows at them."""
 
 from __future__ import annotations
 
