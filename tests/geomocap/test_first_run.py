@@ -1,0 +1,33 @@
+"""The run that compiles the kernels gives the same bits as those that take them from the cache."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+TRACKING = """
+from geomocap.tracking.patch_tracking import track_surface
+from tests.geomocap.moving_ellipsoid import MovingEllipsoid
+from tests.geomocap.test_tracking_patches import SETTINGS
+views = [MovingEllipsoid().view(k) for k in range(6)]
+found = track_surface(lambda k: views[k], len(views), SETTINGS)
+"""
+MATCHING = """
+from geomocap.matching.lsm import match_pairs
+from geomocap.matching.spline import SplineImage
+from tests.geomocap.test_matching_lsm import AFFINE, CENTER, HEIGHT, SHIFT, SPECKLE, WIDTH, grid, warped
+images = SPECKLE.render(HEIGHT, WIDTH), SPECKLE.render(HEIGHT, WIDTH, AFFINE, SHIFT, CENTER)
+found = match_pairs(*(SplineImage.of(image) for image in images), grid(), warped(grid()).round())
+"""
+PRINT = "import hashlib; print(hashlib.sha256(found.positions.tobytes()).hexdigest())"
+
+
+@pytest.mark.parametrize("code", [TRACKING, MATCHING], ids=["tracking", "matching"])
+def test_compiling_changes_no_bit(code: str, tmp_path) -> None:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", code + PRINT]
+    first, second = (
+        subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout for _ in range(2)
+    )
+    assert first == second != ""
