@@ -7,7 +7,6 @@ import math
 import numpy as np
 from numba import njit, prange
 
-
 LEAST_SAMPLES = 0.6
 """Share of a template's samples that a camera must show for it to count."""
 
