@@ -194,7 +194,7 @@ def judge_softness(body: int, model: BodyModel, evidence: Evidence, criterion: C
         return found
     contacts = model.contacts(evidence.adjacency)
     neighbours = np.flatnonzero(contacts[body] >= _LEAST_CONTACTS)
-    share = float((model.label == body).mean())
+    share = float(evidence.counts[model.label == body].sum() / len(model.label))
     if share < criterion.min_share:
         size = share / criterion.min_share
         if not _connects(body, neighbours, contacts):

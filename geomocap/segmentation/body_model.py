@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -15,6 +16,7 @@ _LEAST_CONTACTS = 3
 _LEAST_SHARE = 0.3
 _CORE_SHARE = 0.85
 _STEADY = 0.002
+_BY_ONE = 2 / 3  # that a sample counts where one camera alone sees it
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,14 @@ class Evidence:
     cap: float
     noise: float
     smoothness: float
+
+    @cached_property
+    def counts(self) -> np.ndarray:
+        """What each sample counts in the size of a body, (N,) float: less where one camera alone sees it."""
+        if self.sight is None:
+            return np.ones(len(self.rest))
+        alone = (self.sight.any(axis=2) & self.seen).sum(axis=1) / np.maximum(self.seen.sum(axis=1), 1)
+        return 1.0 - (1.0 - _BY_ONE) * alone
 
     def explain(
         self, samples: np.ndarray, model: BodyModel, allowed: np.ndarray, adjacent: np.ndarray, penalty: float

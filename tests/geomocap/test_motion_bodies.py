@@ -355,6 +355,15 @@ def test_a_small_body_is_one_if_others_hang_together_by_it(three, halved, bodies
     assert find_motion_bodies(MotionPaths(three.positions[kept]), settings).body_count == bodies
 
 
+def test_what_single_cameras_see_counts_less_in_the_size_of_a_body(three):
+    kept = (three.body != 2) | (np.arange(len(three.body)) % 2 == 0)
+    positions, settings = three.positions[kept], MotionBodiesSettings(min_share=0.16)  # the last has 1/5 of the samples
+    sight = seen_by_single_cameras(three, 0.0)[1][kept]
+    assert find_motion_bodies(MotionPaths(positions), settings).body_count == 3
+    assert find_motion_bodies(MotionPaths(positions, sight=sight), settings).body_count == 2
+    assert find_motion_bodies(MotionPaths(positions, sight=sight), MotionBodiesSettings()).body_count == 3
+
+
 def test_precision_beyond_what_surfaces_give_hardly_counts():
     positions = np.zeros((3, 2, 3))
     positions[1:, :, 0] = [[1.0], [2.0]]
