@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit
 
-from geomocap.matching.spline import FAST, cubic_weights, quintic_weights
+from geomocap.matching.spline import ANY_ORDER, cubic_weights, quintic_weights
 
 _F4 = np.float32
 _ZERO = _F4(0)
@@ -28,7 +28,7 @@ def padded(n):
     return (n + 7) // 8 * 8
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
 def sample_template(flat, start, stride, order, ix, iy, radius, patches):
     """Fill patches[0:3] with value and slopes of the spline at the pixels around pixel (ix, iy), by separable sums."""
     n = 2 * radius + 1
@@ -74,7 +74,7 @@ def sample_template(flat, start, stride, order, ix, iy, radius, patches):
                 GY[i, j] = d[4] * (value[i + 4, j] - value[i, j]) + d[3] * (value[i + 3, j] - value[i + 1, j])
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
 def template_mask(masks, start, stride, ix, iy, radius, W):
     """Fill W with 1 where the template may be used; return their number."""
     n = 2 * radius + 1
@@ -90,7 +90,7 @@ def template_mask(masks, start, stride, ix, iy, radius, W):
     return count
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
 def normal_equations(patches, radius, count, H, S, q1, qf, moments):
     """Centre F, form the 6×6 normal matrix from row moments and eliminate offset and gain; return Σ F²."""
     n = 2 * radius + 1
@@ -204,7 +204,7 @@ def normal_equations(patches, radius, count, H, S, q1, qf, moments):
     return ff
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
 def sample_and_project(flat, start, stride, order, px, py, warp, radius, patches, wx, wy, index, G, sums, b):
     """Sample the search image under the warp and sum what the right side needs, in one pass.
 

@@ -17,7 +17,7 @@ from scipy import ndimage
 PAD = 4
 """Coefficients kept beyond each border, pixels; the quintic needs three."""
 
-FAST = {"reassoc", "nsz"}
+ANY_ORDER = {"reassoc", "nsz"}
 """What the compiler may do with sums: add in another order, but not round otherwise.
 
 Code that was just compiled and the same code from the cache are optimised differently; were they free to fuse
@@ -152,7 +152,7 @@ class SplineImage:
         return int(self.stack.layout[0, 2]), int(self.stack.layout[0, 3])
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+@njit(cache=True, nogil=True, fastmath=ANY_ORDER, inline="always")
 def cubic_weights(t, w, j):
     """Put the four cubic B-spline weights at fraction `t` into column `j` of `w`."""
     t2 = t * t
@@ -164,7 +164,7 @@ def cubic_weights(t, w, j):
     w[3, j] = t3 * _SIXTH
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+@njit(cache=True, nogil=True, fastmath=ANY_ORDER, inline="always")
 def quintic_weights(t, w, j):
     """Put the six quintic B-spline weights at fraction `t` into column `j` of `w`."""
     u = _1 - t
@@ -178,7 +178,7 @@ def quintic_weights(t, w, j):
     w[5, j] = t2 * t2 * t * _I120
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
 def weights_and_derivatives(order, t, w, j):
     """Put the weights of spline `order` at fraction `t` into column `j` of `w`, their derivatives into `j + 1`."""
     u = _1 - t

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from geomocap.matching.spline import FAST
+from geomocap.matching.spline import ANY_ORDER
 from geomocap.tracking.patch_templates import LEAST_SAMPLES, LEAST_VARIANCE
 
 _LEAST_FACING = 0.2  # cosine between normal and viewing ray below which a sample is not used
@@ -107,7 +107,7 @@ def compare(A, places, image, count, with_slopes, J, T, b, at, aside, below, val
     return product / count, square / count - (total / count) ** 2
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
 def sum_of(a, count):
     """Sum of the first `count` of `a` (S,) float32, in double precision."""
     total = 0.0
@@ -116,7 +116,7 @@ def sum_of(a, count):
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
 def sum_of_products(a, b, count):
     """Sum of the first `count` products of `a` and `b` (S,) float32, in double precision."""
     total = 0.0
