@@ -57,8 +57,8 @@ class MotionBodiesSettings(Settings):
         default=0.01,
         ge=0,
         lt=0.5,
-        description="smallest body (share of the samples; those that a single camera sees count two thirds), unless two "
-        "others hang together by it alone",
+        description="smallest body (share of the samples; those that one camera alone sees count two thirds), unless "
+        "two others hang together by it",
     )
     soft_share: float = Field(
         default=0.18,
