@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from geomocap.articulation.model import MODEL_FILE, SubjectModel
+from geomocap.articulation.model import MODEL_FILE
 from geomocap.articulation.model_building import BodyCloud, build_model
 from geomocap.errors import GeometryError
 from geomocap.geometry import BodyPoints, Geometry
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.warnings import write_warnings
 from geomocap.segmentation.motion_bodies import MotionBodies
 from geomocap.skeleton.motion_skeleton import MotionSkeleton
 
 
-def make_model(job: Job, geometry: Geometry, found: MotionSkeleton, bodies: MotionBodies) -> SubjectModel | None:
-    """Make and write the model of a run whose points have their bodies; None, with a warning, if it can't be made."""
+def make_model(job: Job, geometry: Geometry, found: MotionSkeleton, bodies: MotionBodies) -> list[str]:
+    """Make and write the model of a run whose points have their bodies; return in words why, if it can't be made."""
 
     def read(frame: int) -> BodyCloud:
         labelled = BodyPoints.read(job.run.frame_file("bodies", frame))
@@ -28,7 +27,6 @@ def make_model(job: Job, geometry: Geometry, found: MotionSkeleton, bodies: Moti
             model = build_model(found, bodies, hinge, read, geometry.spacing)
             count["items"] = len(model.points)
     except GeometryError as error:
-        write_warnings(job.run, [str(error)])
-        return None
+        return [str(error)]
     job.run.write_npz(MODEL_FILE, **model.arrays())
-    return model
+    return []

@@ -11,6 +11,7 @@ from geomocap.geometry import BodyPoints, Geometry
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.model import make_model
 from geomocap.pipeline.paths import motion_paths
+from geomocap.pipeline.warnings import write_warnings
 from geomocap.run import Run
 from geomocap.scheduling import map_items
 from geomocap.segmentation.ellipsoids import Ellipsoids, fit_ellipsoids
@@ -18,6 +19,20 @@ from geomocap.segmentation.motion_bodies import MotionBodies, find_motion_bodies
 from geomocap.segmentation.motion_labels import label_points
 from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
+
+_UNSURE_DEG = 30.0  # 4 to 8 with eight cameras, about 20 with four that still see the bodies
+
+
+def unsure_turns(bodies: MotionBodies) -> list[str]:
+    """Say so if what lies side by side turns too differently for bodies and joints to be trusted."""
+    unevenness = float(np.rad2deg(bodies.unevenness))
+    if unevenness <= _UNSURE_DEG:
+        return []
+    return [
+        f"neighbouring samples of the surface turn by {unevenness:.0f}° against each other (median; at most "
+        f"{_UNSURE_DEG:.0f}° expected): number of bodies, joints and skeleton are not to be trusted; use more cameras, "
+        "more texture or more frames a second"
+    ]
 
 
 def segment_by_motion(job: Job, geometry: Geometry) -> int:
@@ -41,7 +56,9 @@ def segment_by_motion(job: Job, geometry: Geometry) -> int:
     }
     job.run.write_npz("ellipsoids.npz", **together, body=np.arange(bodies.body_count, dtype=np.int32))
     job.run.write_npz("skeleton.npz", **found.skeleton.arrays())
-    make_model(job, geometry, found, bodies)
+    warnings = [*unsure_turns(bodies), *make_model(job, geometry, found, bodies)]
+    if warnings:
+        write_warnings(job.run, warnings)
     job.run.write_npz(
         "diagnostics.npz",
         paths=np.array(source),

@@ -118,6 +118,8 @@ class MotionBodies:
     linkage : Linkage
         Tree of the first grouping, whose cuts are the alternatives.
     extent : float, metres
+    unevenness : float, radians
+        By which samples turn differently from those beside them, median: mostly how unsure the turns are.
     """
 
     label: np.ndarray
@@ -133,6 +135,7 @@ class MotionBodies:
     curve: tuple[EliminationStep, ...]
     linkage: Linkage
     extent: float
+    unevenness: float
 
     @property
     def body_count(self) -> int:
@@ -326,4 +329,5 @@ def _result(
         curve,
         linkage,
         extent,
+        float(np.median(evidence.unevenness)),
     )

@@ -6,6 +6,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
+from geomocap.pipeline.motion import unsure_turns
 from geomocap.segmentation.body_criteria import fixed_share, may_be_joined
 from geomocap.segmentation.motion_bodies import MotionBodiesSettings, find_motion_bodies
 from geomocap.segmentation.motion_labels import label_points
@@ -75,6 +76,13 @@ def test_bodies_are_not_split_where_turns_are_unsure(three, seed):
     drift *= 0.0027 / drift.std()  # metres, of boxes 0.12 m wide
     paths = MotionPaths(three.positions + drift, sigma=np.full(len(drift), 0.0027))
     assert find_motion_bodies(paths).body_count == 3
+
+
+def test_turns_of_noise_are_called_unsure(three, found):
+    assert unsure_turns(found) == []
+    noise = np.random.default_rng(0).normal(0, 0.2, three.positions.shape)  # twice as thick
+    (warning,) = unsure_turns(find_motion_bodies(MotionPaths(three.positions + noise)))
+    assert "not to be trusted" in warning and "more cameras" in warning
 
 
 def test_number_of_bodies_can_be_given(three):
