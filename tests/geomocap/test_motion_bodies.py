@@ -80,7 +80,7 @@ def test_bodies_are_not_split_where_turns_are_unsure(three, seed):
 
 def test_turns_of_noise_are_called_unsure(three, found):
     assert unsure_turns(found) == []
-    noise = np.random.default_rng(0).normal(0, 0.2, three.positions.shape)  # twice as thick
+    noise = np.random.default_rng(0).normal(0, 0.2, three.positions.shape)  # metres, of boxes 0.12 m wide
     (warning,) = unsure_turns(find_motion_bodies(MotionPaths(three.positions + noise)))
     assert "not to be trusted" in warning and "more cameras" in warning
 
