@@ -11,6 +11,7 @@ from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.one_camera import align_alone
 from geomocap.tracking.patch_motion import carried, extrapolate, image_flow, lift_flow, nearest
 from geomocap.tracking.patches import Alignment, Patches, align, facings, visible, with_templates
+from geomocap.tracking.swings import LostPiece
 from geomocap.tracking.tracking_settings import TrackingSettings
 from geomocap.tracking.trajectories import APART, LAST_FRAME, LOW_CORRELATION, LOW_PRECISION, OUTSIDE, UNSEEN
 
@@ -61,6 +62,7 @@ class Followed:
     beside: np.ndarray
     companions: Companions
     by_one: bool
+    pieces: tuple[LostPiece, ...] = ()
 
     @classmethod
     def begin(cls, patches: Patches, identity: np.ndarray, by_one: bool) -> Followed:
@@ -106,6 +108,7 @@ class Followed:
             np.concatenate([self.beside, other.beside]),
             self.companions.join(other.companions),
             self.by_one,
+            self.pieces + other.pieces,
         )
 
 

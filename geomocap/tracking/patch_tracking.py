@@ -18,6 +18,7 @@ from geomocap.tracking.patch_search import Followed, carry_lost, hiding_depth, j
 from geomocap.tracking.patches import Patches, doubted, with_templates
 from geomocap.tracking.reacquisition import reacquire
 from geomocap.tracking.seeding import patch_radius, seed_for_one_camera, seed_patches, seed_spacing
+from geomocap.tracking.swings import find_pieces, lost_pieces
 from geomocap.tracking.track_record import TrackRecord
 from geomocap.tracking.tracking_settings import TrackingSettings
 from geomocap.tracking.trajectories import DOUBLE, LAST_FRAME, Trajectories
@@ -169,12 +170,17 @@ def _next(
     found = search(state, previous, view, settings)
     reason = judge(state, found, view, settings)
     good = reason == LAST_FRAME
+    old, regained = state.patches, np.zeros(len(good), bool)
+    new = lost_pieces(old, state.identity, state.gap == 0, good, spacing)
     state = state.remembering(good)
     found = carry_lost(state, doubted(state.patches, found), good)
-    old, regained = state.patches, np.zeros(len(good), bool)
-    if frame % _LOOK_EVERY == 0:
+    slack = hiding_depth(old, view, settings.slack_px)
+    pieces = state.pieces + new
+    found, swung, pieces = find_pieces(pieces, old, state.identity, good, found, view, slack, spacing)
+    look = ~good if frame % _LOOK_EVERY == 0 else swung
+    if look.any():
         carried = old.moved(found.positions, found.frames)
-        again, seen, cameras = reacquire(carried, ~good, view, hiding_depth(old, view, settings.slack_px), settings)
+        again, seen, cameras = reacquire(carried, look, view, slack, settings)
         again = found.replaced(seen, again)
         places = again.positions, again.frames
         tolerance = settings.neighbour_px * old.size
@@ -186,7 +192,8 @@ def _next(
     shift = found.positions - old.positions
     turn = Rotation.from_matrix(found.frames @ np.swapaxes(old.frames, 1, 2)).as_rotvec()
     # where a patch was carried to is put right, which is no motion: that of the nearest measured one is
-    led, sure = np.flatnonzero(~good), np.flatnonzero(good)
+    moved = good | (regained & (state.gap == 0))
+    led, sure = np.flatnonzero(~moved), np.flatnonzero(good)
     if len(led) and len(sure):
         leader = sure[cKDTree(found.positions[sure]).query(found.positions[led])[1]]
         shift[led], turn[led] = shift[leader], turn[leader]
@@ -208,6 +215,7 @@ def _next(
         beside,
         state.companions,
         state.by_one,
+        pieces,
     )
     lost = (gap > settings.longest_gap) | (reason == DOUBLE)
     record.ended(state.identity[lost], reason[lost], forward)

@@ -220,6 +220,16 @@ def with_templates(patches: Patches, want: np.ndarray, view: FrameViews, sigma: 
     return replace(patches, has=patches.has | got, hidden=hidden, doubt=doubt)
 
 
+def one_template(patches: Patches, view: FrameViews) -> tuple[Patches, np.ndarray]:
+    """Give all cameras the template of the camera (N,) that faces each patch best, of those that have one."""
+    best = np.where(patches.has, facings(patches.positions, patches.normals, view), -2).argmax(axis=1)
+    shared = {
+        name: np.ascontiguousarray(np.repeat(getattr(patches, name)[patches.rows, best][:, None], view.count, axis=1))
+        for name in ("templates", "usable")
+    }
+    return replace(patches, rows=np.arange(len(patches)), has=np.ones_like(patches.has), **shared), best
+
+
 def doubted(patches: Patches, found: Alignment) -> Alignment:
     """Add to standard deviations how well the places were known at which templates were taken: drift adds up."""
     part = found.by_camera > -1

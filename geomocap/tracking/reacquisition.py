@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from geomocap.tracking.frame_views import FrameViews
-from geomocap.tracking.patches import Alignment, Patches, align, facings, visible
+from geomocap.tracking.patches import Alignment, Patches, align, one_template, visible
 from geomocap.tracking.tracking_settings import TrackingSettings
 
 _FACING = 0.35
@@ -45,19 +45,7 @@ def reacquire(
     which = np.flatnonzero(lost & (use.sum(axis=1) >= settings.n_views) & patches.has.any(axis=1))
     some, seen = patches.select(which), use[which]
     rows, C = np.arange(len(which)), view.count
-    best = np.where(some.has, facings(some.positions, some.normals, view), -2).argmax(axis=1)
-    shared = Patches(
-        some.positions,
-        some.frames,
-        some.shape,
-        some.size,
-        rows,
-        np.ascontiguousarray(np.repeat(some.templates[some.rows, best][:, None], C, axis=1)),
-        np.ascontiguousarray(np.repeat(some.usable[some.rows, best][:, None], C, axis=1)),
-        seen,
-        some.hidden,
-        some.doubt,
-    )
+    shared, best = one_template(some, view)
     result = align(
         shared,
         rows,
