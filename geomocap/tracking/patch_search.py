@@ -51,6 +51,8 @@ class Followed:
         Patches beside those that are lost, when these were measured last.
     by_one : bool
         Whether a single camera may follow a patch.
+    pieces : tuple of LostPiece
+        What is looked for elsewhere.
     """
 
     patches: Patches

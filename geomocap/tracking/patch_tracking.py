@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -15,7 +16,7 @@ from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.joining import join_broken
 from geomocap.tracking.lone_depths import adjust_depths
 from geomocap.tracking.patch_search import Followed, carry_lost, hiding_depth, judge, new_views, renewed, search
-from geomocap.tracking.patches import Patches, doubted, with_templates
+from geomocap.tracking.patches import Alignment, Patches, doubted, with_templates
 from geomocap.tracking.reacquisition import reacquire
 from geomocap.tracking.seeding import patch_radius, seed_for_one_camera, seed_patches, seed_spacing
 from geomocap.tracking.swings import find_pieces, lost_pieces
@@ -28,6 +29,8 @@ _DOUBLE = 0.5  # of the spacing: patches nearer than that follow the same surfac
 _LONG_BESIDE = 4  # frames after which the younger one is given up
 _SAME_SIDE = 0.5  # cosine between normals
 _LOOK_EVERY = 3  # frames between looks for lost patches in all cameras
+_SURE = 0.9  # correlation from which such a patch is found,
+_SURE_IN_PIECE = 0.8  # and one of a piece, of which others were found
 
 
 def track_surface(
@@ -170,30 +173,16 @@ def _next(
     found = search(state, previous, view, settings)
     reason = judge(state, found, view, settings)
     good = reason == LAST_FRAME
-    old, regained = state.patches, np.zeros(len(good), bool)
-    new = lost_pieces(old, state.identity, state.gap == 0, good, spacing)
-    state = state.remembering(good)
+    new = lost_pieces(state.patches, state.identity, state.gap == 0, good, spacing)
+    state = replace(state.remembering(good), pieces=state.pieces + new)
     found = carry_lost(state, doubted(state.patches, found), good)
-    slack = hiding_depth(old, view, settings.slack_px)
-    pieces = state.pieces + new
-    found, swung, pieces = find_pieces(pieces, old, state.identity, good, found, view, slack, spacing)
-    look = ~good if frame % _LOOK_EVERY == 0 else swung
-    if look.any():
-        carried = old.moved(found.positions, found.frames)
-        again, seen, cameras = reacquire(carried, look, view, slack, settings)
-        again = found.replaced(seen, again)
-        places = again.positions, again.frames
-        tolerance = settings.neighbour_px * old.size
-        regained = state.companions.agreed(state.identity, good, seen, *places, tolerance)
-        found = found.replaced(regained, again)
-        there = old.moved(found.positions, found.frames)
-        there = with_templates(there, cameras & regained[:, None], view, found.image_sigma)
-        old = there.moved(old.positions, old.frames)
+    state, found, regained = _regain(state, found, good, view, settings, frame, spacing)
+    old = state.patches
     shift = found.positions - old.positions
     turn = Rotation.from_matrix(found.frames @ np.swapaxes(old.frames, 1, 2)).as_rotvec()
     # where a patch was carried to is put right, which is no motion: that of the nearest measured one is
-    moved = good | (regained & (state.gap == 0))
-    led, sure = np.flatnonzero(~moved), np.flatnonzero(good)
+    followed = good | (regained & (state.gap == 0))
+    led, sure = np.flatnonzero(~followed), np.flatnonzero(good)
     if len(led) and len(sure):
         leader = sure[cKDTree(found.positions[sure]).query(found.positions[led])[1]]
         shift[led], turn[led] = shift[leader], turn[leader]
@@ -215,11 +204,51 @@ def _next(
         beside,
         state.companions,
         state.by_one,
-        pieces,
+        state.pieces,
     )
     lost = (gap > settings.longest_gap) | (reason == DOUBLE)
     record.ended(state.identity[lost], reason[lost], forward)
     return state.select(~lost) if lost.any() else state
+
+
+def _regain(
+    state: Followed,
+    found: Alignment,
+    good: np.ndarray,
+    view: FrameViews,
+    settings: TrackingSettings,
+    frame: int,
+    spacing: float,
+) -> tuple[Followed, Alignment, np.ndarray]:
+    """Look for lost patches: for those of pieces anywhere, and now and then for all where their companions have them.
+
+    Returns
+    -------
+    state : Followed
+        With the templates of what was found, and the pieces that are still to be looked for.
+    found : Alignment
+    regained : (N,) bool
+        Patches that were found.
+    """
+    slack = hiding_depth(state.patches, view, settings.slack_px)
+    old, regained = state.patches, np.zeros(len(good), bool)
+    found, swung, pieces = find_pieces(state.pieces, old, state.identity, good, found, view, slack, spacing)
+    looks = [(swung, _SURE_IN_PIECE)] if swung.any() else []
+    if frame % _LOOK_EVERY == 0:
+        looks.append((~good & ~swung, _SURE))
+    for lost, least in looks:
+        carried = old.moved(found.positions, found.frames)
+        again, seen, cameras = reacquire(carried, lost, view, slack, settings, least)
+        again = found.replaced(seen, again)
+        places = again.positions, again.frames
+        tolerance = settings.neighbour_px * old.size
+        back = state.companions.agreed(state.identity, good | regained, seen, *places, tolerance)
+        found = found.replaced(back, again)
+        regained |= back
+        there = old.moved(found.positions, found.frames)
+        there = with_templates(there, cameras & back[:, None], view, found.image_sigma)
+        old = there.moved(old.positions, old.frames)
+    return replace(state, patches=old, pieces=pieces), found, regained
 
 
 def _beside_older(identity: np.ndarray, positions: np.ndarray, normals: np.ndarray, distance: float) -> np.ndarray:

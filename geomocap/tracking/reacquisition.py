@@ -11,12 +11,16 @@ from geomocap.tracking.patches import Alignment, Patches, align, one_template, v
 from geomocap.tracking.tracking_settings import TrackingSettings
 
 _FACING = 0.35
-_SURE = 0.9  # correlation
 _FAR_PX = 7.0  # how far from where its companions have it a patch may be found
 
 
 def reacquire(
-    patches: Patches, lost: np.ndarray, view: FrameViews, slack: np.ndarray, settings: TrackingSettings
+    patches: Patches,
+    lost: np.ndarray,
+    view: FrameViews,
+    slack: np.ndarray,
+    settings: TrackingSettings,
+    least_correlation: float,
 ) -> tuple[Alignment, np.ndarray, np.ndarray]:
     """Look for lost patches in all cameras that should see them, with one template for all cameras.
 
@@ -33,6 +37,8 @@ def reacquire(
     slack : (N, 1) float, metres
         Depth by which something must lie before a patch to hide it.
     settings : TrackingSettings
+    least_correlation : float
+        From which a patch counts as found, on average of the cameras that agree.
 
     Returns
     -------
@@ -61,7 +67,7 @@ def reacquire(
     variance = result.sigma**2 + some.doubt[rows, best] ** 2
     result = replace(result, sigma=np.sqrt(variance), image_sigma=np.sqrt(variance))
     agree = seen & (result.by_camera >= settings.camera_correlation)
-    fits = (agree.sum(axis=1) >= settings.n_views) & (result.correlation >= _SURE)
+    fits = (agree.sum(axis=1) >= settings.n_views) & (result.correlation >= least_correlation)
     fits &= (result.sigma < settings.sigma_px * some.size) & view.may_be_subject(result.positions)
     fits &= np.linalg.norm(result.positions - some.positions, axis=1) < _FAR_PX * some.size
     N = len(patches)

@@ -30,7 +30,7 @@ def test_after_a_turn_a_patch_is_known_again_by_the_next_cameras():
     lost = np.ones(len(seeds), bool)
     lost[:3] = False
     slack = hiding_depth(carried, views[1], SETTINGS.slack_px)
-    again, found, cameras = reacquire(carried, lost, views[1], slack, SETTINGS)
+    again, found, cameras = reacquire(carried, lost, views[1], slack, SETTINGS, 0.9)
     assert not found[:3].any() and found[3:].mean() > 0.7
     away = np.linalg.norm(again.positions - truth, axis=1)[found]
     assert np.median(away) < 0.001 and np.percentile(away, 90) < 0.004  # a pixel is 4 mm
@@ -38,4 +38,4 @@ def test_after_a_turn_a_patch_is_known_again_by_the_next_cameras():
     assert_allclose(again.positions[:3], carried.positions[:3])
     # another piece of this smooth texture is seldom taken for it
     swapped = carried.moved(np.roll(carried.positions, 7, axis=0), np.roll(carried.frames, 7, axis=0))
-    assert reacquire(swapped, lost, views[1], slack, SETTINGS)[1].mean() < 0.15
+    assert reacquire(swapped, lost, views[1], slack, SETTINGS, 0.9)[1].mean() < 0.15
