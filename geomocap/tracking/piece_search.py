@@ -20,14 +20,15 @@ from geomocap.tracking.patches import Alignment, Patches, align, facings, one_te
 from geomocap.tracking.seeding import patch_shape, spread, surface_frames
 
 _FREE = 1.5  # spacings from the nearest patch
-_DENSE = 0.7  # distance of the places looked at, spacings
+_DENSE = 0.7  # distance of the places looked at, spacings,
+_MOST_PLACES = 10_000  # if there are not more than about so many
 _FACING = 0.35
 _HULL_VOXELS = 2.0  # a place may lie so far behind the drawn surface
 _MATCHED, _TRIED = 128, 32  # patches of a piece whose textures are looked for; that stand for it
 _PART = 0.6  # share of them that must fit: the piece may have been two
 _ANGLES = 24  # in which textures are compared
 _PROMISING = 0.6  # least correlation of textures,
-_MATCHES = 100_000  # and most pairs of them
+_MATCHES, _MATCHES_OF_ANGLE = 100_000, 20_000  # and most pairs of them
 _INSIDE = 0.6  # share of the patches that must lie in the silhouettes
 _BESIDE = 1.5  # spacings; a patch is compared with places so near to it
 _CELL = 0.5  # edge of the cells in which these are looked up, spacings
@@ -61,7 +62,8 @@ def free_places(taken: np.ndarray, patches: Patches, view: FrameViews, spacing: 
     C, (L, M) = view.count, patches.templates.shape[2:4]
     if not len(free):
         return Patches.empty(M, C, L)
-    points = free[spread(free, _DENSE * spacing, np.zeros((0, 3)), np.random.default_rng(0))]
+    distance = max(_DENSE * spacing, view.voxel_size * float(np.sqrt(len(free) / _MOST_PLACES)))
+    points = free[spread(free, distance, np.zeros((0, 3)), np.random.default_rng(0))]
     positions, frames, curvature = surface_frames(view, points)
     size = np.full(len(positions), np.median(patches.size))
     blank = Patches.without_templates(positions, frames, patch_shape(curvature, size, _radius(M)), size, C, L)
@@ -158,10 +160,7 @@ def _promising(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Turns (K, 3, 3) and shifts (K, 3) that put the patches `some` (m,) next to places that look like them."""
     alike = _likenesses(_textures(piece), _textures(places))
-    k, i, j = np.nonzero(alike > _PROMISING)
-    if len(k) > _MATCHES:
-        best = np.sort(np.argpartition(-alike[k, i, j], _MATCHES)[:_MATCHES])
-        k, i, j = k[best], i[best], j[best]
+    k, i, j = _best_matches(alike)
     angle = 2 * np.pi * k / _ANGLES
     c, s, o, e = np.cos(angle), np.sin(angle), np.zeros(len(k)), np.ones(len(k))
     in_plane = np.stack([c, -s, o, s, c, o, o, o, e], axis=1).reshape(-1, 3, 3)
@@ -172,7 +171,7 @@ def _promising(
     for who, count in ((some, _LOOKED_AT), (np.arange(len(piece)), 2 * _LIKELY)):
         value = np.empty(len(turns), np.float32)
         own = piece.positions[who], piece.frames[who]
-        together(turns, shifts, *own, places.frames, alike[:, who], low, _CELL * spacing, cells, value)
+        together(turns, shifts, *own, who, places.frames, alike, low, _CELL * spacing, cells, value)
         likely = np.argsort(-value, kind="stable")[:count]
         turns, shifts = turns[likely], shifts[likely]
     inside = view.may_be_subject((X @ turns.swapaxes(1, 2) + shifts[:, None]).reshape(-1, 3))
@@ -219,7 +218,7 @@ def fill_cells(positions, low, edge, reach, cells, squared):
 
 
 @njit(cache=True, nogil=True)
-def together(turns, shifts, X, Q, frames, alike, low, edge, cells, value):
+def together(turns, shifts, X, Q, who, frames, alike, low, edge, cells, value):
     """How much m patches look like the places next to which K motions put them, on average: into `value` (K,).
 
     Parameters
@@ -227,14 +226,16 @@ def together(turns, shifts, X, Q, frames, alike, low, edge, cells, value):
     turns, shifts : (K, 3, 3), (K, 3) float
     X, Q : (m, 3), (m, 3, 3) float
         Patches before the motion.
+    who : (m,) int
+        Which they are among those compared.
     frames : (P, 3, 3) float
         Of the places.
-    alike : (A, m, P) float32
-        How much patches look like places, turned by A angles.
+    alike : (A, n, P) float32
+        How much n patches look like places, turned by A angles.
     low, edge, cells : (3,) float, float, (…) int32
         See `_nearest_places`.
     """
-    A, m = alike.shape[:2]
+    A, m = len(alike), len(X)
     y, turned = np.empty(3), np.empty((3, 3))
     for n in range(len(turns)):
         total = 0.0
@@ -265,7 +266,7 @@ def together(turns, shifts, X, Q, frames, alike, low, edge, cells, value):
             ts = F[0, 1] * turned[0, 0] + F[1, 1] * turned[1, 0] + F[2, 1] * turned[2, 0]
             tt = F[0, 1] * turned[0, 1] + F[1, 1] * turned[1, 1] + F[2, 1] * turned[2, 1]
             k = int(np.rint(np.arctan2(ts - st, ss + tt) * A / (2 * np.pi))) % A
-            total += max(alike[k, p, place], 0.0)
+            total += max(alike[k, who[p], place], 0.0)
         value[n] = total / m
 
 
@@ -312,7 +313,26 @@ def _likenesses(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     radius = _radius(first.shape[1])
     still = _normalised(second @ _turning(radius, 0.0).T).T
     angles = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
-    return np.stack([_normalised(first @ _turning(radius, a).T) @ still for a in angles])
+    alike = np.empty((_ANGLES, len(first), len(second)), np.float32)
+    for k, angle in enumerate(angles):
+        np.matmul(_normalised(first @ _turning(radius, angle).T), still, out=alike[k])
+    return alike
+
+
+def _best_matches(alike: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Angles, patches and places of the highest correlations in `alike` (A, n, P): not more than `_MATCHES`."""
+    kept = []
+    for k, of_angle in enumerate(alike):
+        flat = of_angle.ravel()
+        best = np.flatnonzero(flat > _PROMISING)
+        if len(best) > _MATCHES_OF_ANGLE:
+            best = best[np.argpartition(-flat[best], _MATCHES_OF_ANGLE)[:_MATCHES_OF_ANGLE]]
+        kept.append(k * of_angle.size + np.sort(best))
+    best = np.concatenate(kept)
+    if len(best) > _MATCHES:
+        best = np.sort(best[np.argpartition(-alike.ravel()[best], _MATCHES)[:_MATCHES]])
+    k, i, j = np.unravel_index(best, alike.shape)
+    return k, i, j
 
 
 def _turning(radius: int, angle: float) -> np.ndarray:

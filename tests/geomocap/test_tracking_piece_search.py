@@ -25,17 +25,17 @@ def test_likeness_of_pieces_is_that_of_numpy():
     frames = Rotation.random(P, rng=rng).as_matrix()
     turns, shifts = Rotation.random(K, rng=rng).as_matrix(), rng.uniform(0.2, 0.8, (K, 3))
     X, Q = rng.normal(0, 0.2, (m, 3)), Rotation.random(m, rng=rng).as_matrix()
-    alike = rng.uniform(-1, 1, (A, m, P)).astype(np.float32)
+    alike, who = rng.uniform(-1, 1, (A, m + 3, P)).astype(np.float32), rng.permutation(m + 3)[:m]
     low, cells = np.zeros(3), rng.integers(-1, P, (10, 10, 10)).astype(np.int32)
     value = np.empty(K, np.float32)
-    together(turns, shifts, X, Q, frames, alike, low, edge, cells, value)
+    together(turns, shifts, X, Q, who, frames, alike, low, edge, cells, value)
     at = np.floor((X @ turns.swapaxes(1, 2) + shifts[:, None] - low) / edge).astype(int)
     inside = ((at >= 0) & (at < 10)).all(axis=2)
     place = np.where(inside, cells[tuple(np.moveaxis(at.clip(0, 9), 2, 0))], -1)
     between = frames[place].swapaxes(2, 3) @ (turns[:, None] @ Q)
     angle = np.arctan2(between[..., 1, 0] - between[..., 0, 1], between[..., 0, 0] + between[..., 1, 1])
     k = np.rint(angle * A / (2 * np.pi)).astype(int) % A
-    each = np.where((place >= 0) & (between[..., 2, 2] >= 0.5), np.maximum(alike[k, np.arange(m), place], 0), 0)
+    each = np.where((place >= 0) & (between[..., 2, 2] >= 0.5), np.maximum(alike[k, who, place], 0), 0)
     assert (each > 0).mean() > 0.05
     assert_allclose(value, each.mean(axis=1), rtol=1e-5)
 
