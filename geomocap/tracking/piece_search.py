@@ -322,12 +322,12 @@ def _likenesses(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def _best_matches(alike: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Angles, patches and places of the highest correlations in `alike` (A, n, P): not more than `_MATCHES`."""
     kept = []
-    for k, of_angle in enumerate(alike):
+    for n, of_angle in enumerate(alike):
         flat = of_angle.ravel()
         best = np.flatnonzero(flat > _PROMISING)
         if len(best) > _MATCHES_OF_ANGLE:
             best = best[np.argpartition(-flat[best], _MATCHES_OF_ANGLE)[:_MATCHES_OF_ANGLE]]
-        kept.append(k * of_angle.size + np.sort(best))
+        kept.append(n * of_angle.size + np.sort(best))
     best = np.concatenate(kept)
     if len(best) > _MATCHES:
         best = np.sort(best[np.argpartition(-alike.ravel()[best], _MATCHES)[:_MATCHES]])
