@@ -10,7 +10,7 @@ from geomocap.tracking.companions import Companions
 from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.one_camera import align_alone
 from geomocap.tracking.patch_motion import carried, extrapolate, image_flow, lift_flow, nearest
-from geomocap.tracking.patches import Alignment, Patches, align, doubted, facings, visible, with_templates
+from geomocap.tracking.patches import Alignment, Patches, align, facings, visible, with_templates
 from geomocap.tracking.swings import LostPiece
 from geomocap.tracking.tracking_settings import TrackingSettings
 from geomocap.tracking.trajectories import APART, LAST_FRAME, LOW_CORRELATION, LOW_PRECISION, OUTSIDE, UNSEEN
@@ -26,10 +26,8 @@ _ROUGH = 2 / 3
 _AGREEING = 3  # neighbours whose motion a patch must share
 _SLACK_VOXELS = 2.0
 _ITERATIONS = (6, 10)  # on the coarse and the fine level
-_FINE = (-1, 10)
 _PATIENCE = 5  # frames for which a lost patch is looked for in each; later in every fourth
 _SELDOM = 4
-_RECENT = 2  # frames since a patch was lost in which it is looked for once more where its companions have it
 
 
 @dataclass(frozen=True)
@@ -204,25 +202,6 @@ def carry_lost(state: Followed, found: Alignment, good: np.ndarray) -> Alignment
     return found.at(positions, frames)
 
 
-def search_again(
-    state: Followed, carried_on: Alignment, good: np.ndarray, view: FrameViews, settings: TrackingSettings
-) -> tuple[Alignment, np.ndarray]:
-    """Align patches that were lost lately from where their companions have them; return which were found.
-
-    In a fast motion those that are found first tell the others where to look, so well that the blurred images, which
-    lead astray where something else is near, aren't needed.
-    """
-    lost = np.flatnonzero(~good & (state.gap <= _RECENT))
-    if not len(lost):
-        return carried_on, np.zeros(len(good), bool)
-    again = _align(state, lost, (carried_on.positions, carried_on.frames), view, settings, _FINE)
-    tried = np.zeros(len(good), bool)
-    tried[lost] = True
-    both = carried_on.replaced(tried, doubted(state.patches, again))
-    found = tried & (judge(state, both, view, settings) == LAST_FRAME)
-    return carried_on.replaced(found, both), found
-
-
 def renewed(patches: Patches, found: Alignment, good: np.ndarray, view: FrameViews, templates: str) -> Patches:
     """Take templates of measured patches again: "previous" all, "updated" those that fit badly by now, "first" none."""
     if templates == "first":
@@ -274,7 +253,6 @@ def _align(
     start: tuple[np.ndarray, np.ndarray],
     view: FrameViews,
     settings: TrackingSettings,
-    iterations: tuple[int, int] = _ITERATIONS,
 ) -> Alignment:
     """Align patches with the cameras that see them where they start."""
     patches = state.patches
@@ -286,13 +264,13 @@ def _align(
         *start,
         use,
         view,
-        iterations=iterations,
+        iterations=_ITERATIONS,
         least_correlation=settings.camera_correlation,
     )
     lonely = which[alone[which]]
     if not len(lonely):
         return found
-    other = align_alone(patches, lonely, start, use, view, iterations, settings.camera_correlation)
+    other = align_alone(patches, lonely, start, use, view, _ITERATIONS, settings.camera_correlation)
     return found.replaced(alone, other)
 
 

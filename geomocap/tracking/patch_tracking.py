@@ -15,16 +15,7 @@ from geomocap.scheduling import map_items, threads
 from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.joining import join_broken
 from geomocap.tracking.lone_depths import adjust_depths
-from geomocap.tracking.patch_search import (
-    Followed,
-    carry_lost,
-    hiding_depth,
-    judge,
-    new_views,
-    renewed,
-    search,
-    search_again,
-)
+from geomocap.tracking.patch_search import Followed, carry_lost, hiding_depth, judge, new_views, renewed, search
 from geomocap.tracking.patches import Alignment, Patches, doubted, with_templates
 from geomocap.tracking.reacquisition import reacquire
 from geomocap.tracking.seeding import patch_radius, seed_for_one_camera, seed_patches, seed_spacing
@@ -185,8 +176,6 @@ def _next(
     new = lost_pieces(state.patches, state.identity, state.gap == 0, good, spacing)
     state = replace(state.remembering(good), pieces=state.pieces + new)
     found = carry_lost(state, doubted(state.patches, found), good)
-    found, again = search_again(state, found, good, view, settings)
-    good |= again
     state, found, regained = _regain(state, found, good, view, settings, frame, spacing)
     old = state.patches
     shift = found.positions - old.positions

@@ -12,10 +12,10 @@ from geomocap.geometry import Voxels
 from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.patch_kernel import align_patches
 from geomocap.tracking.patch_motion import lift_flow
-from geomocap.tracking.patch_search import Followed, renewed, search_again
+from geomocap.tracking.patch_search import renewed
 from geomocap.tracking.patch_templates import inverse_diagonal
 from geomocap.tracking.patch_tracking import track_surface
-from geomocap.tracking.patches import Alignment, Patches, align, doubted, with_templates
+from geomocap.tracking.patches import Patches, align, doubted, with_templates
 from geomocap.tracking.seeding import (
     image_reduction,
     patch_radius,
@@ -292,27 +292,6 @@ def test_tracks_follow_the_true_surface(scene, views):
     assert np.degrees(np.median(turned)) < 5  # a patch is nine pixels wide
     assert (tracks.n_views[tracks.measured] >= 2).all()
     assert set(tracks.reasons()) <= set(REASONS)
-
-
-def test_patches_lost_lately_are_found_where_their_companions_have_them(scene, views, seeds):
-    X, Q = moved(scene, seeds, 1)
-    N, C = seeds.has.shape
-    state = Followed.begin(seeds, np.arange(N), False)
-    lost = np.arange(N) % 3 == 0
-    long_ago = np.arange(N) % 6 == 0
-    state = replace(state, gap=np.where(long_ago, 40, 0))
-    near = np.where(lost[:, None], X + np.random.default_rng(2).normal(0, 0.003, X.shape), X)  # a pixel is 4 mm
-    zeros = np.zeros(N)
-    carried = Alignment(near, Q, zeros, zeros.astype(int), zeros, zeros, np.zeros((N, C)))
-    again, found = search_again(state, carried, ~lost, views[1], SETTINGS)
-    assert not found[~lost].any() and not found[long_ago].any()
-    assert found[lost & ~long_ago].mean() > 0.8
-    assert np.percentile(np.linalg.norm(again.positions - X, axis=1)[found], 90) < 0.002
-    assert_allclose(again.positions[~found], near[~found])
-    # what lies elsewhere is not taken for it
-    wrong = carried.at(np.where(lost[:, None], np.roll(near, 9, axis=0), near), Q)
-    assert search_again(state, wrong, ~lost, views[1], SETTINGS)[1].mean() < 0.05
-    assert not search_again(state, carried, np.ones(N, bool), views[1], SETTINGS)[1].any()
 
 
 @pytest.mark.parametrize(("templates", "share"), [("first", 0.0), ("updated", 0.5), ("previous", 1.0)])
