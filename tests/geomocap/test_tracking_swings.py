@@ -117,7 +117,7 @@ def test_a_piece_that_is_where_it_was_carried_is_not_looked_for(views, spacing, 
     slack = hiding_depth(seeds, views[1], SETTINGS.slack_px)
     true = _found(seeds, 1)
     found, placed, left = find_pieces(pieces, seeds, identity, ~top, true, views[1], slack, spacing)
-    assert found.positions is not None and not placed.any() and left == ()
+    assert not placed.any() and left == ()
     assert_allclose(found.positions, true.positions)
 
 
