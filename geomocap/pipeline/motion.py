@@ -15,9 +15,10 @@ from geomocap.pipeline.warnings import write_warnings
 from geomocap.run import Run
 from geomocap.scheduling import map_items
 from geomocap.segmentation.ellipsoids import Ellipsoids, fit_ellipsoids
-from geomocap.segmentation.motion_bodies import MotionBodies, find_motion_bodies
+from geomocap.segmentation.motion_bodies import MotionBodies
 from geomocap.segmentation.motion_labels import label_points
 from geomocap.segmentation.motion_paths import MotionPaths
+from geomocap.segmentation.sight_depths import find_bodies_and_depths
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
 
 _UNSURE_DEG = 30.0  # 4 to 8 with eight cameras, about 20 with four that still see the bodies
@@ -40,7 +41,7 @@ def segment_by_motion(job: Job, geometry: Geometry) -> int:
     frames = len(geometry)
     paths, source = motion_paths(job, geometry)
     job.progress("bodies", 0, 1)
-    bodies = find_motion_bodies(paths, job.config.motion_bodies)
+    bodies, paths = find_bodies_and_depths(paths, job.config.motion_bodies)
     job.progress("bodies", 1, 1)
     with job.run.timed("skeleton") as count:
         found = find_motion_skeleton(bodies, job.fps, job.config.motion_skeleton)

@@ -74,6 +74,11 @@ class MotionBodiesSettings(Settings):
     reach: float = Field(
         default=0.08, gt=0, lt=1, description="a sample may belong to bodies this near along the surface (extents)"
     )
+    depth_rounds: int = Field(
+        default=2,
+        ge=0,
+        description="times that the depths of what single cameras see are found from the bodies, and bodies from these",
+    )
     blends: bool = Field(default=True, description="samples may follow a blend of two bodies, as soft skin does")
     blend_penalty: float = Field(
         default=0.004, ge=0, description="an even blend of two bodies counts as a residual of this (extents)"

@@ -1,0 +1,129 @@
+"""Depths of what single cameras see, from the motions of the bodies."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from geomocap.segmentation.motion_bodies import MotionBodies, MotionBodiesSettings, find_motion_bodies
+from geomocap.segmentation.motion_paths import MotionPaths
+from geomocap.segmentation.sight_depths import find_bodies_and_depths, place_samples, settle_depths
+from tests.geomocap.moving_chains import chain, same_partition, seen_by_single_cameras
+
+DEPTH_SHARE = 0.05
+
+
+@pytest.fixture(scope="module")
+def three():
+    return chain(3)
+
+
+@pytest.fixture(scope="module")
+def alone(three):
+    """The chain as single cameras see it, its hull 30 mm off by turns; and a part of it 100 mm before the surface."""
+    positions, sight = seen_by_single_cameras(three, 0.03)
+    ghost = (three.body == 1) & (sight[:, 0, 1] > 0)
+    positions[ghost] -= 0.1 * sight[ghost]
+    positions[4, 7:11] = np.nan
+    sight[4, 7:11] = 0.0
+    return MotionPaths(positions, sigma=np.full(len(positions), 0.02), sight=sight)
+
+
+@pytest.fixture(scope="module")
+def bodies(alone):
+    return find_motion_bodies(alone)
+
+
+def test_kernel_is_exact_against_numpy(three, alone):
+    rng = np.random.default_rng(1)
+    seen = alone.seen & (rng.random(alone.seen.shape) < 0.9)
+    positions = np.nan_to_num(alone.positions)
+    share = rng.random((len(positions), 3))
+    share /= share.sum(axis=1, keepdims=True)
+    turns = np.einsum("nb,tbij->ntij", share, three.rotations)
+    shifts = np.einsum("nb,tbi->nti", share, three.translations)
+    sight = np.where((rng.random(len(positions)) < 0.8)[:, None, None], alone.sight, 0.0)
+    for rotations, translations in ((turns, shifts), (turns[:1], shifts[:1])):
+        rest, miss, depth = place_samples(positions, seen, sight, rotations, translations, 0.05)
+        sure = np.eye(3) - (1 - DEPTH_SHARE**2) * sight[..., :, None] * sight[..., None, :]
+        carry = np.broadcast_to(rotations, turns.shape)
+        away = positions - translations
+        normal = np.einsum("nt,ntji,ntjk,ntkl->nil", seen, carry, sure, carry) + 1e-9 * np.eye(3)
+        expected = np.linalg.solve(normal, np.einsum("nt,ntji,ntjk,ntk->ni", seen, carry, sure, away)[..., None])[
+            ..., 0
+        ]
+        assert_allclose(rest, expected, rtol=1e-9, atol=1e-12)
+        left = np.einsum("ntij,nj->nti", carry, expected) - away
+        along = (left * sight).sum(axis=2)
+        across = np.minimum(((left - along[..., None] * sight) ** 2).sum(axis=2), 0.05**2)
+        assert_allclose(depth, np.where(seen, along, 0.0), atol=1e-10)
+        assert_allclose(miss, np.sqrt((across * seen).sum(axis=1) / seen.sum(axis=1)), atol=1e-10)
+
+
+def test_depths_are_those_with_which_bodies_are_rigid(three, alone, bodies):
+    settled = settle_depths(alone, bodies)
+    seen = alone.seen
+    before, after = (np.linalg.norm(p.positions - three.positions, axis=2)[seen] for p in (alone, settled))
+    assert np.median(before) > 0.02 and np.quantile(before, 0.95) > 0.08
+    assert np.median(after) < 0.25 * np.median(before)
+    assert np.quantile(after, 0.95) < 0.5 * np.quantile(before, 0.95)
+
+
+def test_positions_move_along_their_lines_of_sight_only(alone, bodies):
+    settled = settle_depths(alone, bodies)
+    moved = (settled.positions - alone.positions)[alone.seen]
+    sight = alone.sight[alone.seen]
+    assert_allclose(moved, (moved * sight).sum(axis=1, keepdims=True) * sight, atol=1e-12)
+    assert_array_equal(settled.seen, alone.seen)
+    assert settled.sight is alone.sight
+
+
+def test_what_several_cameras_see_stays(three, bodies, alone):
+    positions, sight = seen_by_single_cameras(three, 0.03)
+    sight[::2] = 0.0
+    positions[::2] = three.positions[::2]
+    settled = settle_depths(MotionPaths(positions, sight=sight), bodies)
+    assert_array_equal(settled.positions[::2], positions[::2])
+    known = MotionPaths(three.positions)
+    assert settle_depths(known, bodies) is known
+
+
+def test_a_piece_before_the_surface_comes_to_the_body_behind_it(three, alone, bodies):
+    piece = (three.body == 1) & (alone.sight[:, 0, 1] > 0)
+    torn = MotionBodies(**{**bodies.__dict__, **_with_a_body_of(piece, bodies)})
+    settled = settle_depths(alone, torn)
+    error = np.linalg.norm(settled.positions - three.positions, axis=2)[piece]
+    assert (
+        np.nanmedian(error)
+        < 0.02
+        < 0.08
+        < np.nanmedian(np.linalg.norm(alone.positions - three.positions, axis=2)[piece])
+    )
+
+
+def _with_a_body_of(piece: np.ndarray, bodies: MotionBodies) -> dict[str, np.ndarray]:
+    """Fields of bodies of which a piece has come off and stands still."""
+    frames = len(bodies.rotations)
+    label = np.where(piece, bodies.body_count, bodies.label)
+    weights = np.pad(bodies.weights, ((0, 0), (0, 1)))
+    weights[piece] = np.eye(bodies.body_count + 1)[-1]
+    still = np.tile(np.eye(3), (frames, 1, 1, 1))
+    return {
+        "label": label.astype(np.int32),
+        "weights": weights,
+        "rotations": np.concatenate([bodies.rotations, still], axis=1),
+        "translations": np.pad(bodies.translations, ((0, 0), (0, 1), (0, 0))),
+    }
+
+
+def test_bodies_come_out_better_by_their_own_depths(three, alone, bodies):
+    found, paths = find_bodies_and_depths(alone)
+    assert same_partition(found.label, three.body) >= same_partition(bodies.label, three.body)
+    assert found.body_count == 3
+    assert_array_equal(found.positions[paths.seen], paths.positions[paths.seen])
+    at_once, same = find_bodies_and_depths(alone, MotionBodiesSettings(depth_rounds=0))
+    assert same is alone
+    assert_array_equal(at_once.label, bodies.label)
+
+
+def test_depths_repeat_bit_for_bit(alone, bodies):
+    assert_array_equal(settle_depths(alone, bodies).positions, settle_depths(alone, bodies).positions)
