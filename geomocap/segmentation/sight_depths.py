@@ -20,7 +20,7 @@ from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.segmentation.rigid_motions import fit_rigid_motion
 
 _DEPTH_SHARE = 0.05  # of what is missed along a line of sight, counts for a sample's place
-_ROUNDS = 4  # in which samples choose bodies and these move anew
+_ROUNDS = 2  # in which samples choose bodies and these move anew
 _EXPLAINED = 2.0  # median misses by which a body may miss a sample that it explains,
 _NEARLY_BEST = 1.5  # or so many times those of the body that explains it best
 _LARGEST = 0.015  # extents; larger misses count as this
@@ -179,6 +179,7 @@ def _place(paths: MotionPaths, rotations: np.ndarray, translations: np.ndarray) 
         np.ascontiguousarray(paths.sight, np.float64),
         np.ascontiguousarray(rotations),
         np.ascontiguousarray(translations),
+        _DEPTH_SHARE,
         _LARGEST * paths.extent,
     )
     return _Places(*found)
@@ -191,6 +192,7 @@ def place_samples(
     sight: np.ndarray,
     rotations: np.ndarray,
     translations: np.ndarray,
+    depth_share: float,
     largest: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Places at rest from which given motions come nearest to the positions, mostly across their lines of sight.
@@ -203,6 +205,8 @@ def place_samples(
         Directions along which misses count little; 0: all count.
     rotations, translations : (N or 1, T, 3, 3), (N or 1, T, 3) float
         Motions since rest of each sample, or of all; rotations may be blends.
+    depth_share : float
+        Of what is missed along a line of sight, counts.
     largest : float, metres
         Larger misses count as this in their mean.
 
@@ -216,9 +220,10 @@ def place_samples(
     """
     count, frames = seen.shape
     rest, miss, depth = np.zeros((count, 3)), np.zeros(count), np.zeros((count, frames))
-    part = 1.0 - _DEPTH_SHARE**2
+    part = 1.0 - depth_share**2
+    motion = np.arange(count) if len(rotations) > 1 else np.zeros(count, np.int64)
     for i in numba.prange(count):
-        m = min(np.int64(i), len(rotations) - 1)
+        m = motion[i]
         away, ray = np.empty(3), np.empty(3)
         normal, right = _REGULAR * np.eye(3), np.zeros(3)
         for t in range(frames):

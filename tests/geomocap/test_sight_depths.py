@@ -43,7 +43,7 @@ def test_kernel_is_exact_against_numpy(three, alone):
     shifts = np.einsum("nb,tbi->nti", share, three.translations)
     sight = np.where((rng.random(len(positions)) < 0.8)[:, None, None], alone.sight, 0.0)
     for rotations, translations in ((turns, shifts), (turns[:1], shifts[:1])):
-        rest, miss, depth = place_samples(positions, seen, sight, rotations, translations, 0.05)
+        rest, miss, depth = place_samples(positions, seen, sight, rotations, translations, DEPTH_SHARE, 0.05)
         sure = np.eye(3) - (1 - DEPTH_SHARE**2) * sight[..., :, None] * sight[..., None, :]
         carry = np.broadcast_to(rotations, turns.shape)
         away = positions - translations
