@@ -77,7 +77,7 @@ class MotionBodiesSettings(Settings):
     depth_rounds: int = Field(
         default=2,
         ge=0,
-        description="times that the depths of what single cameras see are found from the bodies, and bodies from these",
+        description="times that depths of what single cameras see are found from the bodies, and bodies from these",
     )
     blends: bool = Field(default=True, description="samples may follow a blend of two bodies, as soft skin does")
     blend_penalty: float = Field(

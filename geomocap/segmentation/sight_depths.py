@@ -55,17 +55,21 @@ def find_bodies_and_depths(
 ) -> tuple[MotionBodies, MotionPaths]:
     """Find bodies, from their motions the depths of what single cameras see, and bodies from these; again and again.
 
-    So `depth_rounds` times. Parameters and errors are those of `find_motion_bodies`. Also returns the paths that the
-    bodies are of.
+    Wrong depths tear bodies into pieces. So of the first bodies and those of `depth_rounds` further rounds the fewest
+    are taken, the latest of equally many. Parameters and errors are those of `find_motion_bodies`. Also returns the
+    paths that the bodies are of.
     """
     settings = settings or MotionBodiesSettings()
     bodies = find_motion_bodies(paths, settings)
     if paths.sight is None:
         return bodies, paths
+    fewest = bodies, paths
     for _ in range(settings.depth_rounds):
-        paths = settle_depths(paths, bodies)
-        bodies = find_motion_bodies(paths, settings)
-    return bodies, paths
+        settled = settle_depths(paths, bodies)
+        bodies = find_motion_bodies(settled, settings)
+        if bodies.body_count <= fewest[0].body_count:
+            fewest = bodies, settled
+    return fewest
 
 
 def settle_depths(paths: MotionPaths, bodies: MotionBodies) -> MotionPaths:
