@@ -12,10 +12,11 @@ from geomocap.segmentation.connected_linkage import connected_linkage
 from geomocap.segmentation.local_rotations import local_rotations, turn_distances
 from geomocap.segmentation.motion_bodies import find_motion_bodies
 from geomocap.segmentation.motion_paths import MotionPaths
+from geomocap.segmentation.sight_depths import place_samples
 from geomocap.segmentation.surface_graph import surface_graph
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
 from tests.benchmarks.table import Row, measure
-from tests.geomocap.moving_chains import chain
+from tests.geomocap.moving_chains import chain, seen_by_single_cameras
 
 
 def benchmark() -> list[Row]:
@@ -34,6 +35,20 @@ def benchmark() -> list[Row]:
         for i in range(len(flat)):
             cosine = (np.einsum("tc,ntc->nt", flat[i], flat) - 1.0) / 2.0
             np.percentile(np.arccos(np.clip(cosine, -1.0, 1.0)), 95, axis=1)
+
+    alone, sight = seen_by_single_cameras(moving, 0.03)
+    seen = np.ones(alone.shape[:2], bool)
+    turned, shifted = moving.rotations[None, :, 0].copy(), moving.translations[None, :, 0].copy()
+
+    def places_by_numpy() -> None:
+        sure = np.eye(3) - (1 - 0.05**2) * sight[..., :, None] * sight[..., None, :]
+        carried = sure @ turned
+        normal = np.einsum("tji,ntjk->nik", turned[0], carried)
+        right = np.einsum("ntji,ntj->ni", carried, alone - shifted)
+        place = np.linalg.solve(normal, right[..., None])[..., 0]
+        left = np.einsum("tij,nj->nti", turned[0], place) + shifted - alone
+        across = left - (left * sight).sum(axis=2, keepdims=True) * sight
+        np.sqrt(np.minimum((across**2).sum(axis=2), 0.05**2).mean(axis=1))
 
     start = time.perf_counter()
     turns_by_numpy()
@@ -58,6 +73,12 @@ def benchmark() -> list[Row]:
             measure(lambda: find_motion_bodies(paths), 1, warm_up=False),
             goal="10 s on a quiet machine",
             note=f"{bodies.body_count} bodies of 10",
+        ),
+        Row(
+            "places of 1500 samples on a body, by one camera each",
+            measure(lambda: place_samples(alone, seen, sight, turned, shifted, 0.05, 0.05), 3),
+            "NumPy",
+            measure(places_by_numpy, 3),
         ),
         Row("skeleton, 10 bodies, 60 frames", measure(lambda: find_motion_skeleton(bodies, 30.0), 1)),
     ]
