@@ -40,9 +40,7 @@ def segment_by_motion(job: Job, geometry: Geometry) -> int:
     """Find bodies and skeleton from motion paths, write them, and return the number of frames."""
     frames = len(geometry)
     paths, source = motion_paths(job, geometry)
-    job.progress("bodies", 0, 1)
-    bodies, paths = find_bodies_and_depths(paths, job.config.motion_bodies)
-    job.progress("bodies", 1, 1)
+    bodies, paths = find_bodies_and_depths(paths, job.config.motion_bodies, job.progress)
     with job.run.timed("skeleton") as count:
         found = find_motion_skeleton(bodies, job.fps, job.config.motion_skeleton)
         count["items"] = frames

@@ -15,6 +15,7 @@ import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
+from geomocap.progress import Progress, silent
 from geomocap.segmentation.motion_bodies import MotionBodies, MotionBodiesSettings, find_motion_bodies
 from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.segmentation.rigid_motions import fit_rigid_motion
@@ -30,6 +31,7 @@ _CORE = 0.85  # share of one body that makes a sample tell its motion
 _LEAST = 6  # samples of a body
 _NOISE = 2e-4  # extents
 _REGULAR = 1e-9
+_STAGE = "bodies"
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class _Places:
 
 
 def find_bodies_and_depths(
-    paths: MotionPaths, settings: MotionBodiesSettings | None = None
+    paths: MotionPaths, settings: MotionBodiesSettings | None = None, progress: Progress = silent
 ) -> tuple[MotionBodies, MotionPaths]:
     """Find bodies, from their motions the depths of what single cameras see, and bodies from these; again and again.
 
@@ -60,15 +62,17 @@ def find_bodies_and_depths(
     paths that the bodies are of.
     """
     settings = settings or MotionBodiesSettings()
+    rounds = settings.depth_rounds if paths.sight is not None and paths.sight.any() else 0
+    progress(_STAGE, 0, 1 + rounds)
     bodies = find_motion_bodies(paths, settings)
-    if paths.sight is None:
-        return bodies, paths
+    progress(_STAGE, 1, 1 + rounds)
     fewest = bodies, paths
-    for _ in range(settings.depth_rounds):
+    for k in range(rounds):
         settled = settle_depths(paths, bodies)
         bodies = find_motion_bodies(settled, settings)
         if bodies.body_count <= fewest[0].body_count:
             fewest = bodies, settled
+        progress(_STAGE, 2 + k, 1 + rounds)
     return fewest
 
 
@@ -85,7 +89,7 @@ def settle_depths(paths: MotionPaths, bodies: MotionBodies) -> MotionPaths:
     paths : MotionPaths
         Without `sight` they are returned as they are.
     bodies : MotionBodies
-        Found from these paths.
+        Found from these paths, or from these at other depths.
 
     Returns
     -------

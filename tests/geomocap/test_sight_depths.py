@@ -1,9 +1,12 @@
 """Depths of what single cameras see, from the motions of the bodies."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from geomocap.segmentation import sight_depths
 from geomocap.segmentation.motion_bodies import MotionBodies, MotionBodiesSettings, find_motion_bodies
 from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.segmentation.sight_depths import find_bodies_and_depths, place_samples, settle_depths
@@ -123,6 +126,23 @@ def test_bodies_come_out_better_by_their_own_depths(three, alone, bodies):
     at_once, same = find_bodies_and_depths(alone, MotionBodiesSettings(depth_rounds=0))
     assert same is alone
     assert_array_equal(at_once.label, bodies.label)
+
+
+def test_the_fewest_bodies_of_all_rounds_are_taken(monkeypatch, alone, bodies):
+    counts = iter([5, 3, 3, 4])
+    found, reported = [], []
+
+    def find(paths, settings):
+        count = next(counts)
+        found.append((replace(bodies, rotations=bodies.rotations[:, np.arange(count) % bodies.body_count]), paths))
+        return found[-1][0]
+
+    monkeypatch.setattr(sight_depths, "find_motion_bodies", find)
+    monkeypatch.setattr(sight_depths, "settle_depths", lambda paths, _: replace(paths))
+    settings = MotionBodiesSettings(depth_rounds=3)
+    best, paths = find_bodies_and_depths(alone, settings, lambda *step: reported.append(step))
+    assert best is found[2][0] and paths is found[2][1]
+    assert reported == [("bodies", k, 4) for k in range(5)]
 
 
 def test_depths_repeat_bit_for_bit(alone, bodies):
