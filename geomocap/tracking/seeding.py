@@ -245,7 +245,8 @@ def _lock(
     ray = patches.positions - view.centers[reference]
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     step = _SWEEP_PX * float(np.median(patches.size)) if N else 1.0
-    shifts = np.arange(-settings.search_front, settings.search_depth + step, step)
+    extent = float(np.linalg.norm(np.ptp(view.surface, axis=0)))
+    shifts = np.arange(-settings.search_front * extent, settings.search_depth * extent + step, step)
     scores = np.empty((N, len(shifts)))
     for j, shift in enumerate(shifts):
         moved = patches.positions + shift * ray

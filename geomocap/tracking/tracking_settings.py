@@ -40,8 +40,12 @@ class TrackingSettings(Settings):
         10, ge=1, description="Frames between two looks for surface without patches; the last frame is looked at too"
     )
     seed_correlation: float = Field(0.85, gt=0, lt=1, description="Least correlation between cameras for a new patch")
-    search_front: float = Field(0.015, ge=0, description="How far before the surface a new patch is looked for (m)")
-    search_depth: float = Field(0.06, ge=0, description="How far behind the surface a new patch is looked for (m)")
+    search_front: float = Field(
+        0.0075, ge=0, lt=1, description="How far before the surface a new patch is looked for (share of the extent)"
+    )
+    search_depth: float = Field(
+        0.03, ge=0, lt=1, description="How far behind the surface a new patch is looked for (share of the extent)"
+    )
     correlation: float = Field(0.85, gt=0, lt=1, description="Least mean correlation of a tracked patch")
     camera_correlation: float = Field(0.6, gt=0, lt=1, description="Least correlation for a camera to count")
     n_views: int = Field(2, ge=2, description="Least number of cameras that agree on a new patch")
