@@ -177,7 +177,8 @@ class _System:
             by_frame[width - size, 1:-1] -= 2.0 * w
             by_frame[width - size, 2:] -= 2.0 * w
             by_frame[width - 2 * size, 2:] += w
-        least = 1e-9 * max(float(diagonal.max()), 1e-12)
+        largest = diagonal.max(axis=0)  # of turns and shifts apart: these depend on the unit of length
+        least = 1e-9 * np.where(largest > 0, largest, 1.0)
         by_frame[width] = diagonal * (1.0 + damping) + least
         return bands
 

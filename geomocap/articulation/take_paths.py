@@ -105,8 +105,9 @@ def turned_by_paths(
         if len(mine) < _LEAST_MEMBERS:
             continue
         rest = positions[mine, 0]
+        sight = None if paths.sight is None else paths.sight[mine]
         for _ in range(_SETTLE_ROUNDS):
-            turned, moved, _ = fit_rigid_motion(positions[mine], rest, weights[mine], noise)
+            turned, moved, _ = fit_rigid_motion(positions[mine], rest, weights[mine], noise, sight=sight)
             back = ((positions[mine] - moved)[:, :, None] @ turned)[:, :, 0]
             rest = (weights[mine, :, None] * back).sum(axis=1) / weights[mine].sum(axis=1)[:, None]
         shown = paths.seen[mine].sum(axis=0)

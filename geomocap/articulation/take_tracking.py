@@ -195,7 +195,7 @@ def _fit_all(
             points = SkinPoints(*(np.concatenate([getattr(points, n), getattr(skin, n)]) for n in _SKIN))
             sigma = np.hypot(paths.typical_sigma(), 0.2 * scales.sigma) / np.sqrt(settings.path_independence)
             spread = np.broadcast_to(sigma[:, None], paths.seen.shape)
-            sightings = sightings.joined(Observations.of_paths(paths.positions, spread, count))
+            sightings = sightings.joined(Observations.of_paths(paths.positions, spread, count, paths.sight))
         prior = _smoothness(linkage, motion, model.extent, settings)
         motion = adjust(linkage, motion, points, sightings, smoothness=prior, rounds=3).motion
     return motion

@@ -23,6 +23,7 @@ from geomocap.skeleton.temporal_smoothing import smooth_positions, smooth_rotati
 
 _UNSEEN = 0.05
 _BRIDGE = 1e-3
+_LEAST_MISS = 5e-4  # extents
 
 
 class MotionSkeletonSettings(Settings):
@@ -116,7 +117,7 @@ def _smooth_motion(bodies: MotionBodies, middle: np.ndarray, strength: float) ->
         bridged = strength if strength > 0 else (_BRIDGE if (weights < _UNSEEN).any() else 0.0)
         weights = np.where(weights < _UNSEEN, 0.0, weights)
         rotations[:, b] = smooth_rotations(bodies.rotations[:, b], weights, bridged)
-        path = smooth_positions(bodies.centers[:, b], weights, bridged)
+        path = smooth_positions(bodies.centers[:, b], weights, bridged, _LEAST_MISS * bodies.extent)
         translations[:, b] = path - rotations[:, b] @ middle[b]
     return rotations, translations
 

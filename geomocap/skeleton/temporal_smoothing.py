@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 _ROUNDS = 6
 _LEAST_TURN = 5e-3  # radians: misses below are all the same
-_LEAST_MISS = 1e-3  # metres
 
 
 def smooth_rotations(rotations: np.ndarray, weights: np.ndarray, strength: float) -> np.ndarray:
@@ -45,10 +44,10 @@ def smooth_rotations(rotations: np.ndarray, weights: np.ndarray, strength: float
     return estimate.as_matrix()
 
 
-def smooth_positions(positions: np.ndarray, weights: np.ndarray, strength: float) -> np.ndarray:
+def smooth_positions(positions: np.ndarray, weights: np.ndarray, strength: float, least: float) -> np.ndarray:
     """Positions (T, 3) of least weighted misfit plus `strength` times the square of their acceleration.
 
-    See `smooth_rotations`.
+    See `smooth_rotations`; misses below `least` (metres) are all the same.
     """
     known = np.flatnonzero(weights > 0)
     if strength <= 0 or len(positions) < 3 or len(known) < 2:
@@ -58,7 +57,7 @@ def smooth_positions(positions: np.ndarray, weights: np.ndarray, strength: float
     for _ in range(_ROUNDS):
         smooth = _whittaker(positions, still, robust, strength)
         size = np.linalg.norm(positions - smooth, axis=1)
-        robust = weights / (1.0 + (size / (3.0 * max(float(np.median(size[known])), _LEAST_MISS))) ** 2)
+        robust = weights / (1.0 + (size / (3.0 * max(float(np.median(size[known])), least))) ** 2)
     return smooth
 
 

@@ -82,6 +82,38 @@ class NodeTracks:
         return MotionPaths(self.positions[seen], sigma=self.sigma[seen], parts=parts)
 
 
+@dataclass(frozen=True)
+class Unit:
+    """Length and place by which points are tracked alike in whatever unit and wherever they are.
+
+    Attributes
+    ----------
+    length : float, metres
+        A power of two, so that scaling by it is exact: more than half the points' extent, at most all of it.
+    origin : (3,) float, metres
+    """
+
+    length: float
+    origin: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray) -> Unit:
+        """Unit of points (M, 3), M ≥ 0."""
+        if not len(points):
+            return cls(1.0, np.zeros(3))
+        extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+        length = 2.0 ** np.floor(np.log2(extent)) if extent > 0 else 1.0
+        return cls(length, np.round(points.mean(axis=0) / length) * length)
+
+    def to(self, points: np.ndarray) -> np.ndarray:
+        """Points (…, 3) in metres, in this unit."""
+        return (points - self.origin) / self.length
+
+    def back(self, points: np.ndarray) -> np.ndarray:
+        """Points (…, 3) in this unit, in metres."""
+        return self.length * points + self.origin
+
+
 class NodeModel:
     """The reference surface with its coarse and its fine graph."""
 
@@ -185,10 +217,11 @@ def track_nodes(
     if executor is None:
         with threads() as own:
             return track_nodes(points, n_frames, settings, features, progress, own, anchors)
+    unit = Unit.of(np.asarray(points(0), float))
 
     def prepare(frame: int) -> PointSet:
         more = None if features is None else features(frame)
-        found = np.asarray(points(frame), float)
+        found = unit.to(np.asarray(points(frame), float))
         # dense points are averaged over as much of the surface as few points are
         neighbours = max(settings.neighbours, min(len(found), 3 * settings.points) * 5 // (2 * settings.nodes))
         return point_set(found, settings.points, neighbours, settings.seed + frame, more)
@@ -214,7 +247,7 @@ def track_nodes(
         )
 
     coarse = list(map_items(coarsen, list(range(n_frames)), executor, "ends of limbs", progress))
-    known = np.zeros((0, n_frames, 3)) if anchors is None else np.asarray(anchors, float)
+    known = np.zeros((0, n_frames, 3)) if anchors is None else unit.to(np.asarray(anchors, float))
     (ahead, homes_ahead), (back, homes_back) = map_items(
         lambda way: follow(model.coarse, coarse, reference, way, known), [1, -1], executor, "coarse motion", progress
     )
@@ -239,4 +272,5 @@ def track_nodes(
         x, R = found.carry(model.graph.nodes)
         parts = found.label
     x[lost] = np.nan
-    return NodeTracks(x, R, covariance, reference, model.graph.nodes, model.graph.edges, parts)
+    places = unit.back(model.graph.nodes)
+    return NodeTracks(unit.back(x), R, unit.length**2 * covariance, reference, places, model.graph.edges, parts)

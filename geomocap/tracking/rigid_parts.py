@@ -136,7 +136,7 @@ class PartTracker:
         """Nodes (N,) that points suit as well if they stay where they are, `at_rest`, as the way they were followed."""
         N, T = forms.weight.shape
         weight, followed = np.maximum(at_rest.weight, 1e-6), np.maximum(forms.weight, 1e-6)
-        worst = int(_RESTING_FRAMES * (T - 1))
+        worst = int(np.ceil(_RESTING_FRAMES * (T - 1)))  # all of a few frames
         more = np.sort(at_rest.cost / weight - forms.cost / followed, axis=1)[:, worst]
         support = np.sort(at_rest.weight / followed, axis=1)[:, T - 1 - worst]
         still = (more < (self.settings.part_misfit * self.graph.spacing) ** 2) & (support > _RESTING_SUPPORT)

@@ -278,6 +278,18 @@ def test_refinement_hardly_heeds_what_is_unsure_along_the_line_of_sight():
     assert errors[1] < 0.4 * errors[0]
 
 
+def test_refinement_is_the_same_in_another_unit():
+    scene = chain(3, frames=40)
+    positions = scene.positions + np.random.default_rng(7).normal(0, 0.004, scene.positions.shape)
+    joints = []
+    for unit in (1.0, 2.0**20):
+        paths = MotionPaths(unit * positions)
+        bodies = find_motion_bodies(paths, MotionBodiesSettings(bodies=3))
+        refined, _ = refine_skeleton(find_motion_skeleton(bodies, 30.0), bodies, paths)
+        joints.append(refined.skeleton.joint_positions / unit)
+    np.testing.assert_allclose(joints[0], joints[1], atol=2e-4)
+
+
 def test_refined_skeleton_is_nearer_to_the_truth_and_keeps_its_bones():
     scene = chain(3, frames=40)
     rng = np.random.default_rng(7)

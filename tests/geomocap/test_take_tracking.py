@@ -130,6 +130,32 @@ def test_tracked_points_are_hung_on_the_model(model):
     np.testing.assert_allclose(skin.rest, model.points[some], atol=1e-9)
 
 
+def unsure(places):
+    """Paths of some points that one camera sees: along its lines of sight they are wrong, more so higher up."""
+    some = places[:, ::20].swapaxes(0, 1).copy()
+    away = some - np.array([3.0, -3.5, 1.5])
+    sight = away / np.linalg.norm(away, axis=2, keepdims=True)
+    wrong = 0.15 * some[..., 2] * np.sin(1.3 * np.arange(len(places)))
+    return MotionPaths(some + wrong[..., None] * sight, sigma=np.full(some.shape[:2], 0.002), sight=sight)
+
+
+def test_depths_of_a_single_camera_do_not_draw_the_model_away(model):
+    true, places = take_of(model)
+    found = track_take(model, lambda t: (places[t], None), len(places), SPACING, 2, unsure(places))
+    apart = model.linkage.joint_positions(found.bodies) - model.linkage.joint_positions(true)
+    assert np.linalg.norm(apart, axis=2).max() < 0.025
+
+
+def test_turns_are_seen_across_the_line_of_sight(model):
+    true, places = take_of(model)
+    paths = unsure(places)
+    motion, bodies = rolled(model, true, 0.5 * np.sin(np.arange(len(places))))
+    skin = attach_paths(model, true, paths, 0.2)
+    found = body_motion(model.linkage, turned_by_paths(model.linkage, motion, bodies, skin, paths, 1e-4))
+    turns = [np.swapaxes(m.rotations[:, 2], 1, 2)[:-1] @ m.rotations[1:, 2] for m in (found, true)]
+    assert np.rad2deg(turn_angles(np.swapaxes(turns[0], 1, 2) @ turns[1])).mean() < 2.5
+
+
 def rolled(model, true, about):
     """The motion with a head that rolls about its own length as the surface, nearly round, can't see."""
     local = np.tile(np.eye(3), (len(true.rotations), 3, 1, 1))

@@ -293,6 +293,28 @@ def test_the_same_again_with_other_threads(bending):
     np.testing.assert_array_equal(again.rotations, tracks.rotations)
 
 
+def test_the_same_in_another_unit_and_elsewhere(bending):
+    angles, tracks = bending
+
+    def points(frame: int) -> np.ndarray:
+        return 1024.0 * bend(capsule(1500, seed=10 + frame), angles[frame])
+
+    there = track_nodes(points, len(angles), SMALL)
+    np.testing.assert_array_equal(there.positions, 1024.0 * tracks.positions)
+    np.testing.assert_array_equal(there.covariance, 1024.0**2 * tracks.covariance)
+    away = track_nodes(lambda t: points(t) + 1024.0 * 4096.0, len(angles), SMALL)
+    moved = away.positions / 1024.0 - 4096.0 - tracks.positions
+    assert np.abs(moved).max() < 1e-6
+
+
+@pytest.mark.parametrize("still", [1, 2, 5])
+def test_motion_in_a_single_frame_of_a_few_is_seen(still):
+    shift = np.array([0.1, 0.05, 0.0])
+    tracks = track_nodes(lambda t: capsule(1500) + (t == still) * shift, still + 1, SMALL)
+    moved = tracks.positions[:, still] - tracks.positions[:, 0]
+    np.testing.assert_allclose(np.nanmedian(moved, axis=0), shift, atol=0.01)
+
+
 def test_no_frames():
     with pytest.raises(GeometryError, match="without frames"):
         track_nodes(lambda t: np.zeros((0, 3)), 0)
