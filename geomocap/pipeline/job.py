@@ -59,7 +59,8 @@ class Job:
         work : callable
             Does the work and returns the number of items worked on.
         optional : sequence of str
-            Files that it may write; old ones are deleted as well when the key has changed.
+            Files that it may write, or that others make from its outputs; old ones are deleted as well when the key
+            has changed.
         """
         if not self.run.is_done(name, key):
             self.run.begin(name, key, outputs, optional)

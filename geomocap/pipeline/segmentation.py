@@ -8,6 +8,7 @@ from functools import partial
 from geomocap.articulation.model import MODEL_FILE
 from geomocap.geometry import BodyPoints, Geometry
 from geomocap.pipeline.clouds import bounds_of
+from geomocap.pipeline.derived import KEYPOINT_FILES
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.motion import segment_by_motion
 from geomocap.pipeline.sources import Source, geometry_of
@@ -36,7 +37,8 @@ def segment(job: Job, source: Source) -> str:
         outputs.remove("skeleton.npz")
     key = stage_key("segmentation", source_key, tracks(job) if has_tracks else None, settings, job.fps)
     work = partial(segment_by_motion, has_tracks=has_tracks) if by_motion else segment_as_m3
-    return job.stage("segmentation", key, outputs, lambda: work(job, geometry), [MODEL_FILE, WARNINGS_FILE])
+    optional = [MODEL_FILE, WARNINGS_FILE, *KEYPOINT_FILES]
+    return job.stage("segmentation", key, outputs, lambda: work(job, geometry), optional)
 
 
 def _is_tracked(job: Job, source: Source) -> bool:

@@ -12,6 +12,7 @@ from geomocap.carving.views import Undistortion
 from geomocap.errors import CaptureError
 from geomocap.geometry import Voxels, read_cloud
 from geomocap.pipeline.clouds import HULL_CAMERAS, clouds
+from geomocap.pipeline.derived import KEYPOINT_FILES
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.voxels import voxels
 from geomocap.run import Run, stage_key
@@ -40,7 +41,7 @@ def tracks(job: Job) -> str:
     settings = {name: getattr(job.config, name).model_dump() for name in ("tracking", "filters", "smoothing")}
     surface = voxels(job) if _has_hull(capture) else clouds(job)
     key = stage_key("tracks", surface, pictures, settings, job.fps)
-    return job.stage("tracks", key, ["tracks.npz"], lambda: _track(job, capture))
+    return job.stage("tracks", key, ["tracks.npz"], lambda: _track(job, capture), KEYPOINT_FILES)
 
 
 def _track(job: Job, capture: Capture) -> int:

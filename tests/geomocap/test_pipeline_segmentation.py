@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 
 from geomocap.config import load_config
-from geomocap.pipeline import Job, segment
+from geomocap.export.trc import read_trc
+from geomocap.pipeline import Job, motion_files, segment
+from geomocap.pipeline.derived import KEYPOINT_FILES
 from geomocap.run import Run
 from geomocap.scans import open_scans
 from geomocap.scheduling import threads
 from tests.geomocap.moving_chains import chain
 
-SETTINGS = {"nodes": {"nodes": 60, "coarse_nodes": 40, "points": 600, "coarse_points": 400}}
+SETTINGS = {"nodes": {"nodes": 30, "coarse_nodes": 20, "points": 300, "coarse_points": 200}}
+M3 = {"segmentation": {"method": "m3", "max_depth": 3}}
 
 
 @pytest.fixture
@@ -29,7 +32,7 @@ def job(tmp_path):
 
 
 def scanned(frames: int) -> np.ndarray:
-    return chain(2, frames, samples=600).positions.swapaxes(0, 1)
+    return chain(2, frames, samples=200).positions.swapaxes(0, 1)
 
 
 def test_scans_leave_tracks_of_a_capture_alone(job):
@@ -38,3 +41,29 @@ def test_scans_leave_tracks_of_a_capture_alone(job):
     scans.run.write_npz("tracks.npz", positions=tracks, sigma=np.full((500, 6), 0.002))
     segment(scans, "scans")
     assert scans.run.read_npz("diagnostics.npz")["paths"] == "nodes"
+
+
+def follow(run: Run, frames: int) -> None:
+    run.write_npz("keypoints.npz", names=np.array(["tip"]), positions=np.zeros((frames, 1, 3)), radius=np.array([0.1]))
+    for name in ("keypoints.toml", "keypoints.trc", "keypoints.c3d"):
+        (run.path / name).touch()
+
+
+def test_key_points_go_with_the_bodies_they_were_followed_on(job):
+    first = job(scanned(6), M3)
+    segment(first, "scans")
+    follow(first.run, 6)
+    motion_files(first, "scans")
+    assert "tip" in read_trc(first.run.path / "motion.trc").names
+    motion_files(job(scanned(5), M3), "scans")
+    assert not [name for name in KEYPOINT_FILES if (first.run.path / name).exists()]
+    assert (first.run.path / "keypoints.toml").exists()
+    assert "tip" not in read_trc(first.run.path / "motion.trc").names
+
+
+def test_motion_files_are_written_anew_with_key_points_followed_since(job):
+    done = job(scanned(6), M3)
+    motion_files(done, "scans")
+    follow(done.run, 6)
+    motion_files(done, "scans")
+    assert "tip" in read_trc(done.run.path / "motion.trc").names
