@@ -8,7 +8,7 @@ from functools import partial
 from geomocap.articulation.model import MODEL_FILE
 from geomocap.geometry import BodyPoints, Geometry
 from geomocap.pipeline.clouds import bounds_of
-from geomocap.pipeline.derived import KEYPOINT_FILES
+from geomocap.pipeline.derived import FROM_BODIES
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.motion import segment_by_motion
 from geomocap.pipeline.sources import Source, geometry_of
@@ -32,12 +32,11 @@ def segment(job: Job, source: Source) -> str:
     has_tracks = by_motion and _is_tracked(job, source)
     tables = ("nodes", "motion_bodies", "motion_skeleton", "refinement") if by_motion else ("skeleton",)
     settings = {name: getattr(config, name).model_dump() for name in ("segmentation", *tables)}
-    outputs = ["ellipsoids.npz", "bodies", "diagnostics.npz", "skeleton.npz"]
-    if len(geometry) == 1:  # a single frame has no motion to tell bodies and joints by
-        outputs.remove("skeleton.npz")
+    outputs, optional = ["ellipsoids.npz", "bodies", "diagnostics.npz"], [MODEL_FILE, WARNINGS_FILE, *FROM_BODIES]
+    # a single frame has no motion to tell bodies and joints by
+    (outputs if len(geometry) > 1 else optional).append("skeleton.npz")
     key = stage_key("segmentation", source_key, tracks(job) if has_tracks else None, settings, job.fps)
     work = partial(segment_by_motion, has_tracks=has_tracks) if by_motion else segment_as_m3
-    optional = [MODEL_FILE, WARNINGS_FILE, *KEYPOINT_FILES]
     return job.stage("segmentation", key, outputs, lambda: work(job, geometry), optional)
 
 

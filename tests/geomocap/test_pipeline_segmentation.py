@@ -67,3 +67,15 @@ def test_motion_files_are_written_anew_with_key_points_followed_since(job):
     follow(done.run, 6)
     motion_files(done, "scans")
     assert "tip" in read_trc(done.run.path / "motion.trc").names
+
+
+def test_one_scan_leaves_no_motion_of_the_sequence_before_it(job):
+    sequence = job(scanned(5), M3)
+    motion_files(sequence, "scans")
+    assert (sequence.run.path / "skeleton.npz").exists() and (sequence.run.path / "motion.bvh").exists()
+    motion_files(job(scanned(5)[:1], M3), "scans")
+    assert not (sequence.run.path / "skeleton.npz").exists()
+    assert not list(sequence.run.path.glob("motion.*"))
+    assert len(sequence.run.read_npz("ellipsoids.npz")["centers"]) == 1
+    motion_files(job(scanned(5), M3), "scans")
+    assert (sequence.run.path / "motion.bvh").exists()
