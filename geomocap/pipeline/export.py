@@ -11,7 +11,8 @@ from geomocap.run import stage_key
 
 
 def motion_files(job: Job, source: Source) -> str:
-    """Take a capture or scans all the way to the motion files, and return the stage's key."""
+    """Take a capture or scans all the way to the motion files, as the record says then; return the stage's key."""
+    job.write_record()
     segmented = segment(job, source)
     if not (job.run.path / "skeleton.npz").exists():
         return segmented
