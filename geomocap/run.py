@@ -109,7 +109,7 @@ class Run:
     # --- stages ---
 
     def begin(self, stage: str, key: str, outputs: Sequence[str], optional: Sequence[str] = ()) -> None:
-        """Open a stage for writing: if its key has changed, delete what it wrote before.
+        """Open a stage for writing: if its key has changed, delete what it wrote before and what was made from that.
 
         Parameters
         ----------
@@ -119,7 +119,7 @@ class Run:
         outputs : sequence of str
             Files and folders of the run that the stage always writes.
         optional : sequence of str
-            Those that it may write.
+            Those that it may write, or that others make from its outputs.
         """
         if self._state(stage).get("key") == key:
             return

@@ -32,9 +32,7 @@ def capture_job(
     _check_apart(capture, run)
     _check_model(model, run)
     with executor_for(workers, scheduler) as executor, progress_bars() as progress:
-        job = Job(Run(run), config, executor, progress, capture=opened, fps=opened.fps, model=model)
-        job.write_record()
-        yield job
+        yield Job(Run(run), config, executor, progress, capture=opened, fps=opened.fps, model=model)
 
 
 @contextmanager
@@ -52,9 +50,7 @@ def scans_job(
     _check_apart(scans, run)
     _check_model(model, run)
     with executor_for(workers, scheduler) as executor, progress_bars() as progress:
-        job = Job(Run(run), config, executor, progress, scans=opened, fps=fps, model=model)
-        job.write_record()
-        yield job
+        yield Job(Run(run), config, executor, progress, scans=opened, fps=fps, model=model)
 
 
 def _check_model(model: Path | None, run: Path) -> None:

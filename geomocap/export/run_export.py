@@ -28,6 +28,7 @@ from geomocap.export.trc import write_trc
 from geomocap.export.usd import write_usd
 from geomocap.progress import Progress, silent
 from geomocap.run import Run
+from geomocap.settings import check_settings
 
 FILES = {
     "bvh": "motion.bvh",
@@ -79,6 +80,7 @@ def export_run(
     formats : sequence of str, optional
         Of bvh, trc, c3d, glb, usd, csv, parquet. By default all whose packages are installed.
     settings : ExportSettings, optional
+        By default those of the run.
     names : Names, optional
         The user's names; by default those of `RUN/names.toml` if it is there.
     folder : Path, optional
@@ -91,8 +93,10 @@ def export_run(
         If a format that was asked for can't be written, or the skeleton can't be used.
     RunError
         If there is no skeleton.
+    SettingsError
+        If the run's settings are wrong.
     """
-    settings = settings or ExportSettings()
+    settings = settings or run_settings(run)
     unknown = sorted(set(formats or ()) - set(FILES))
     if unknown:
         raise MotionError(f"{unknown[0]}: no motion format; expected one of {', '.join(FILES)}")
@@ -120,6 +124,13 @@ def export_run(
         progress("export", k + 1, len(chosen))
     shifting = tuple(n for n, m, j in zip(motion.names, motion.moving, motion.joints, strict=True) if m and j >= 0)
     return Exported(files, skipped, motion.largest_deviation_mm(skeleton["joint_positions"]), shifting)
+
+
+def run_settings(run: Run) -> ExportSettings:
+    """Return the settings that a run's motion files were made with, as its record says; the defaults if it doesn't."""
+    file = run.path / "run.toml"
+    recorded = run.read_record().get("config", {}).get("export", {}) if file.is_file() else {}
+    return check_settings(ExportSettings, recorded, str(file))
 
 
 def run_up(run: Run) -> Axis:

@@ -47,6 +47,7 @@ def clouds(job: Job) -> str:
             pass
         return len(missing)
 
+    job.write_record("cloud")
     return job.stage("cloud", key, ["cloud"], work)
 
 

@@ -11,12 +11,13 @@ from geomocap.run import stage_key
 
 
 def motion_files(job: Job, source: Source) -> str:
-    """Take a capture or scans all the way to the motion files, and return the stage's key."""
+    """Take a capture or scans all the way to the motion files, as the record says then; return the stage's key."""
+    job.write_record()
     segmented = segment(job, source)
     if not (job.run.path / "skeleton.npz").exists():
         return segmented
-    names = fingerprint([job.run.path / "names.toml"])
-    key = stage_key("export", segmented, job.config.export.model_dump(), job.up, names)
+    beside = fingerprint(job.run.path / name for name in ("names.toml", "keypoints.npz"))
+    key = stage_key("export", segmented, job.config.export.model_dump(), job.up, beside)
 
     def work() -> int:
         written = export_run(job.run, settings=job.config.export, progress=job.progress)

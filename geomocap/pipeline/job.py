@@ -8,6 +8,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import geomocap
 from geomocap.capture import Capture
@@ -59,7 +60,8 @@ class Job:
         work : callable
             Does the work and returns the number of items worked on.
         optional : sequence of str
-            Files that it may write; old ones are deleted as well when the key has changed.
+            Files that it may write, or that others make from its outputs; old ones are deleted as well when the key
+            has changed.
         """
         if not self.run.is_done(name, key):
             self.run.begin(name, key, outputs, optional)
@@ -68,22 +70,42 @@ class Job:
             self.run.finish(name)
         return key
 
-    def write_record(self) -> None:
-        """Write `run.toml`: source, settings and versions, enough to repeat the run."""
-        source = (
-            self.capture.path if self.capture is not None else self.scans.source if self.scans is not None else None
-        )
-        model = {} if self.model is None else {"model": str(self.model)}
-        kind = "capture" if self.capture is not None else "scans"
+    def write_record(self, *tables: str) -> None:
+        """Write `run.toml`: source, settings and versions, enough to repeat the run.
+
+        Parameters
+        ----------
+        *tables : str
+            Tables of the settings to write: the other ones, and the model, stay as recorded before if the source is
+            the same. By default all is written anew.
+        """
+        path = self.capture.path if self.capture is not None else self.scans.source if self.scans is not None else None
+        source = {
+            "kind": "capture" if self.capture is not None else "scans",
+            "path": str(path),
+            "fps": self.fps,
+            "up": self.up,
+        }
+        before = self._recorded(source) if tables else {}
+        model = before.get("source", {}).get("model") if self.model is None else str(self.model)
+        kept = before.get("config", {})
+        settings = self.config.model_dump(mode="json", exclude_none=True)
         packages = ("numpy", "scipy", "numba", "open3d", "opencv-python-headless", "pycolmap", "trimesh")
         self.run.write_record(
             {
                 "geomocap": {"version": geomocap.__version__},
-                "source": {"kind": kind, "path": str(source), "fps": self.fps, "up": self.up, **model},
+                "source": source if model is None else {**source, "model": model},
                 "versions": {"python": platform.python_version(), **{p: version(p) for p in packages}},
-                "config": self.config.model_dump(mode="json", exclude_none=True),
+                "config": {k: table if k in tables else kept.get(k, table) for k, table in settings.items()},
             }
         )
+
+    def _recorded(self, source: dict[str, Any]) -> dict[str, Any]:
+        """Read the run's record; empty if there is none of this source."""
+        record = self.run.read_record() if (self.run.path / "run.toml").is_file() else {}
+        kind, path = (record.get("source", {}).get(k, "") for k in ("kind", "path"))
+        same = kind == source["kind"] and Path(path).resolve() == Path(source["path"]).resolve()
+        return record if same else {}
 
     @property
     def up(self) -> str:

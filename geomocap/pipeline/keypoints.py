@@ -16,6 +16,7 @@ from geomocap.export.errors import MissingPackageError
 from geomocap.export.markers import Markers, keypoint_markers
 from geomocap.export.run_export import run_up
 from geomocap.export.trc import write_trc
+from geomocap.pipeline.derived import KEYPOINT_FILES
 from geomocap.run import Run
 from geomocap.tracking.keypoint_file import KeyPointFile, follow_regions
 from geomocap.tracking.keypoints import REACH, KeyPointPaths, Measured
@@ -89,7 +90,7 @@ def write_results(run: Run, file: KeyPointFile, paths: KeyPointPaths) -> Followe
 
 def clear_results(run: Run) -> None:
     """Delete what `keypoints` wrote, so that nothing stale is left."""
-    for name in ("keypoints.npz", "keypoints.trc", "keypoints.c3d"):
+    for name in KEYPOINT_FILES:
         (run.path / name).unlink(missing_ok=True)
 
 

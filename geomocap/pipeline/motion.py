@@ -36,10 +36,13 @@ def unsure_turns(bodies: MotionBodies) -> list[str]:
     ]
 
 
-def segment_by_motion(job: Job, geometry: Geometry) -> int:
-    """Find bodies and skeleton from motion paths, write them, and return the number of frames."""
+def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
+    """Find bodies and skeleton from motion paths, write them, and return the number of frames.
+
+    `has_tracks` is what `motion_paths` takes.
+    """
     frames = len(geometry)
-    paths, source = motion_paths(job, geometry)
+    paths, source = motion_paths(job, geometry, has_tracks)
     bodies, paths = find_bodies_and_depths(paths, job.config.motion_bodies, job.progress)
     with job.run.timed("skeleton") as count:
         found = find_motion_skeleton(bodies, job.fps, job.config.motion_skeleton)

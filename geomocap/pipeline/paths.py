@@ -20,8 +20,15 @@ ANCHORS = 2000  # trajectories that keep nodes from sliding
 ANCHOR_SHARE = 0.1  # those are measured in this share of the frames at least
 
 
-def motion_paths(job: Job, geometry: Geometry) -> tuple[MotionPaths, str]:
+def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> tuple[MotionPaths, str]:
     """Motion paths and what they are: "patches", "nodes", "both" (nodes with patches as anchors) or "ellipsoids".
+
+    Parameters
+    ----------
+    job : Job
+    geometry : Geometry
+    has_tracks : bool
+        Whether the surface was tracked in the job's images; any other `tracks.npz` in the run is none of the job's.
 
     Raises
     ------
@@ -33,9 +40,7 @@ def motion_paths(job: Job, geometry: Geometry) -> tuple[MotionPaths, str]:
         settings = job.config.segmentation
         found = ellipsoid_paths(geometry.points, len(geometry), geometry.spacing, settings, job.executor, job.progress)
         return MotionPaths(found.ellipsoids.centers.swapaxes(0, 1)), wanted
-    tracked = None
-    if wanted != "nodes" and (job.run.path / "tracks.npz").exists():
-        tracked = job.run.read_npz("tracks.npz")
+    tracked = job.run.read_npz("tracks.npz") if has_tracks else None
     if tracked is not None and wanted != "both":
         paths = patch_paths(tracked)
         if paths is not None and (wanted == "patches" or _covers(paths)):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
 
 from geomocap.articulation.model import MODEL_FILE
 from geomocap.geometry import BodyPoints, Geometry
 from geomocap.pipeline.clouds import bounds_of
+from geomocap.pipeline.derived import FROM_BODIES
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.motion import segment_by_motion
 from geomocap.pipeline.sources import Source, geometry_of
@@ -28,27 +29,20 @@ def segment(job: Job, source: Source) -> str:
     if job.model is not None:
         return segment_with_model(job, geometry, source_key)
     by_motion = config.segmentation.method == "motion" and len(geometry) > 1
-    settings: dict[str, Any] = {"segmentation": config.segmentation.model_dump()}
-    if by_motion:
-        if config.segmentation.paths not in ("nodes", "ellipsoids") and _has_volume(job, source):
-            settings["tracks"] = tracks(job)
-        settings |= {
-            name: getattr(config, name).model_dump()
-            for name in ("nodes", "motion_bodies", "motion_skeleton", "refinement")
-        }
-    else:
-        settings["skeleton"] = config.skeleton.model_dump()
-    outputs = ["ellipsoids.npz", "bodies", "diagnostics.npz", "skeleton.npz"]
-    if len(geometry) == 1:  # a single frame has no motion to tell bodies and joints by
-        outputs.remove("skeleton.npz")
-    key = stage_key("segmentation", source_key, settings, job.fps)
-    work = segment_by_motion if by_motion else segment_as_m3
-    return job.stage("segmentation", key, outputs, lambda: work(job, geometry), [MODEL_FILE, WARNINGS_FILE])
+    has_tracks = by_motion and _is_tracked(job, source)
+    tables = ("nodes", "motion_bodies", "motion_skeleton", "refinement") if by_motion else ("skeleton",)
+    settings = {name: getattr(config, name).model_dump() for name in ("segmentation", *tables)}
+    outputs, optional = ["ellipsoids.npz", "bodies", "diagnostics.npz"], [MODEL_FILE, WARNINGS_FILE, *FROM_BODIES]
+    # a single frame has no motion to tell bodies and joints by
+    (outputs if len(geometry) > 1 else optional).append("skeleton.npz")
+    key = stage_key("segmentation", source_key, tracks(job) if has_tracks else None, settings, job.fps)
+    work = partial(segment_by_motion, has_tracks=has_tracks) if by_motion else segment_as_m3
+    return job.stage("segmentation", key, outputs, lambda: work(job, geometry), optional)
 
 
-def _has_volume(job: Job, source: Source) -> bool:
-    """Whether there is a volume, on which the surface is tracked in the images."""
-    if job.capture is None:
+def _is_tracked(job: Job, source: Source) -> bool:
+    """Whether the surface is to be tracked in the images, which takes a volume."""
+    if job.capture is None or job.config.segmentation.paths in ("nodes", "ellipsoids"):
         return False
     return source != "cloud" or bounds_of(job.capture, job.config.cloud) == "hull"
 

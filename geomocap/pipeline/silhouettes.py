@@ -38,6 +38,7 @@ def silhouettes(job: Job) -> str:
         capture.fingerprint("images", "videos", "background", "masks", "sparse"),
         job.config.silhouettes.model_dump(),
     )
+    job.write_record("silhouettes")
     return job.stage("silhouettes", key, ["silhouettes"], lambda: _make_silhouettes(job, capture))
 
 

@@ -13,6 +13,7 @@ from geomocap.articulation.model import MODEL_FILE, SubjectModel, read_model
 from geomocap.articulation.take_tracking import TrackedTake, track_take
 from geomocap.files import fingerprint
 from geomocap.geometry import BodyPoints, Geometry
+from geomocap.pipeline.derived import FROM_BODIES
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.paths import patch_paths
 from geomocap.pipeline.tracks import tracks
@@ -38,7 +39,7 @@ def segment_with_model(job: Job, geometry: Geometry, source_key: str) -> str:
     )
     outputs = ["ellipsoids.npz", "bodies", "diagnostics.npz", "skeleton.npz", MODEL_FILE]
     work = partial(_follow, job, geometry, model, patches is not None)
-    return job.stage("segmentation", key, outputs, work, [WARNINGS_FILE])
+    return job.stage("segmentation", key, outputs, work, [WARNINGS_FILE, *FROM_BODIES])
 
 
 def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) -> int:

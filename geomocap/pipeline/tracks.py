@@ -12,6 +12,7 @@ from geomocap.carving.views import Undistortion
 from geomocap.errors import CaptureError
 from geomocap.geometry import Voxels, read_cloud
 from geomocap.pipeline.clouds import HULL_CAMERAS, clouds
+from geomocap.pipeline.derived import KEYPOINT_FILES
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.voxels import voxels
 from geomocap.run import Run, stage_key
@@ -37,10 +38,12 @@ def tracks(job: Job) -> str:
     if capture is None:
         raise CaptureError("tracks need a capture")
     pictures = capture.fingerprint("images", "videos", "sparse")
-    settings = {name: getattr(job.config, name).model_dump() for name in ("tracking", "filters", "smoothing")}
+    tables = ("tracking", "filters", "smoothing")
+    settings = {name: getattr(job.config, name).model_dump() for name in tables}
     surface = voxels(job) if _has_hull(capture) else clouds(job)
     key = stage_key("tracks", surface, pictures, settings, job.fps)
-    return job.stage("tracks", key, ["tracks.npz"], lambda: _track(job, capture))
+    job.write_record(*tables)
+    return job.stage("tracks", key, ["tracks.npz"], lambda: _track(job, capture), KEYPOINT_FILES)
 
 
 def _track(job: Job, capture: Capture) -> int:

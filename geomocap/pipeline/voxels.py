@@ -33,6 +33,7 @@ def voxels(job: Job) -> str:
     key = stage_key(
         "voxels", silhouettes(job), capture.fingerprint("images", "videos", "sparse"), settings.model_dump()
     )
+    job.write_record("carving")
     return job.stage("voxels", key, ["voxels"], lambda: _carve_all(job, capture, settings))
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from geomocap.export.trc import read_trc
 from geomocap.run import Run
 from tests.cli.conftest import last_line
+from tests.geomocap.articulated import skeleton_arrays
 
 FILE = '[[keypoint]]\nname = "tip"\ncenter = [0.0, 0.0, 0.0]\nradius = 0.05\n'
 
@@ -29,6 +31,15 @@ def test_key_points_of_the_run_or_of_another_file(geomocap, run, tmp_path):
     geomocap("keypoints", run.path, "--points", tmp_path / "other.toml")
     np.testing.assert_allclose(run.read_npz("keypoints.npz")["positions"][:, 0, 0], np.arange(5) * 0.01, atol=1e-6)
     assert run.read_npz("keypoints.npz")["names"].tolist() == ["top"]
+
+
+def test_motion_files_keep_the_run_s_settings(geomocap, run):
+    run.write_npz("skeleton.npz", **skeleton_arrays(n_frames=5))
+    run.write_record({"source": {"fps": 25.0}, "config": {"export": {"trc_unit": "m"}}})
+    geomocap("keypoints", run.path)
+    markers = read_trc(run.path / "motion.trc")
+    assert "tip" in markers.names
+    assert (run.path / "motion.trc").read_text().splitlines()[2].split()[4] == "m"
 
 
 @pytest.mark.parametrize(

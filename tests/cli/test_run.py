@@ -96,6 +96,14 @@ def test_changed_setting_does_again_only_what_depends_on_it(small_capture, geomo
     assert digests(run)["voxels/000000.ply"] != first["voxels/000000.ply"]
 
 
+def test_stage_commands_record_what_each_was_done_with(small_capture, geomocap, tmp_path):
+    run = tmp_path / "run"
+    geomocap("voxels", small_capture, run, *SETTINGS)
+    geomocap("silhouettes", small_capture, run, "--silhouettes.samples", 5)
+    settings = tomllib.loads((run / "run.toml").read_text())["config"]
+    assert settings["carving"]["resolution"] == 64 and settings["silhouettes"]["samples"] == 5
+
+
 def test_given_masks_are_used_as_they_are(capture, small_capture, geomocap, tmp_path):
     truth = small_capture.parent / "truth" / "masks"
     (capture / "masks").symlink_to(truth)

@@ -3,7 +3,7 @@ import sys
 import numpy as np
 import pytest
 
-from geomocap.errors import RunError
+from geomocap.errors import RunError, SettingsError
 from geomocap.export.errors import MotionError
 from geomocap.export.names import Names
 from geomocap.export.run_export import FILES, export_run
@@ -102,6 +102,19 @@ def test_up_is_the_captures(run):
     run.write_record({"source": {"up": "sideways"}})
     with pytest.raises(MotionError, match=r"source\.up is 'sideways'"):
         export_run(run, ["trc"])
+
+
+def test_settings_are_the_runs_unless_given(run):
+    export_run(run, ["bvh"], ExportSettings(bvh_unit="cm"))
+    centimetres = (run.path / "motion.bvh").read_bytes()
+    export_run(run, ["bvh"])
+    assert (run.path / "motion.bvh").read_bytes() != centimetres
+    run.write_record({"source": {"up": "z"}, "config": {"export": {"bvh_unit": "cm"}}})
+    export_run(run, ["bvh"])
+    assert (run.path / "motion.bvh").read_bytes() == centimetres
+    run.write_record({"config": {"export": {"bvh_unit": "mm"}}})
+    with pytest.raises(SettingsError, match=r"run\.toml: setting bvh_unit = 'mm'"):
+        export_run(run, ["bvh"])
 
 
 def test_no_skeleton(tmp_path):

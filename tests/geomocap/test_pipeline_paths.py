@@ -59,34 +59,38 @@ def trajectories(count: int, seen: float) -> np.ndarray:
     return tracks
 
 
-def test_nodes_leave_trajectories_and_colours_alone(job):
-    paths, source = motion_paths(job("nodes", trajectories(500, 1.0)), Ball())
+def test_nodes_leave_colours_alone(job):
+    paths, source = motion_paths(job("nodes"), Ball(), False)
     assert source == "nodes"
     assert paths.count == 60
 
 
 def test_patches_where_they_cover_the_subject(job):
-    assert motion_paths(job("auto", trajectories(500, 1.0)), Ball())[1] == "patches"
+    assert motion_paths(job("auto", trajectories(500, 1.0)), Ball(), True)[1] == "patches"
 
 
 def test_both_where_there_are_too_few_patches(job):
-    assert motion_paths(job("auto", trajectories(100, 1.0)), Ball())[1] == "both"
+    assert motion_paths(job("auto", trajectories(100, 1.0)), Ball(), True)[1] == "both"
 
 
 def test_nodes_without_patches(job):
-    assert motion_paths(job("auto"), Ball())[1] == "nodes"
+    assert motion_paths(job("auto"), Ball(), False)[1] == "nodes"
+
+
+def test_tracks_of_another_job_are_left_alone(job):
+    assert motion_paths(job("auto", trajectories(500, 1.0)), Ball(), False)[1] == "nodes"
 
 
 def test_both_although_patches_cover_the_subject(job):
-    assert motion_paths(job("both", trajectories(500, 1.0)), Ball())[1] == "both"
+    assert motion_paths(job("both", trajectories(500, 1.0)), Ball(), True)[1] == "both"
 
 
 def test_few_patches_where_they_are_asked_for(job):
-    assert motion_paths(job("patches", trajectories(100, 1.0)), Ball())[1] == "patches"
+    assert motion_paths(job("patches", trajectories(100, 1.0)), Ball(), True)[1] == "patches"
 
 
 def test_ellipsoids_of_the_paper(job):
-    paths, source = motion_paths(job("ellipsoids", trajectories(500, 1.0)), Ball())
+    paths, source = motion_paths(job("ellipsoids"), Ball(), False)
     assert source == "ellipsoids"
     middles = [Ball().points(k).mean(axis=0) for k in range(FRAMES)]
     np.testing.assert_allclose(paths.positions, [middles], atol=1e-6)  # the ball is one
@@ -94,7 +98,7 @@ def test_ellipsoids_of_the_paper(job):
 
 def test_patches_that_are_not_there(job):
     with pytest.raises(GeometryError, match=r"segmentation\.paths = nodes"):
-        motion_paths(job("patches"), Ball())
+        motion_paths(job("patches"), Ball(), False)
 
 
 def test_lines_of_sight_go_with_the_paths_where_single_cameras_saw_them():

@@ -1,9 +1,16 @@
-"""The surface that tracks start on."""
+"""The surface that tracks start on, and what goes when they are made anew."""
 
 import importlib
 
 import numpy as np
 from numpy.testing import assert_allclose
+
+from geomocap.config import load_config
+from geomocap.pipeline import Job
+from geomocap.pipeline.derived import KEYPOINT_FILES
+from geomocap.run import Run
+from geomocap.scheduling import threads
+from tests.geomocap.test_pipeline_clouds import make_capture
 
 stage = importlib.import_module("geomocap.pipeline.tracks")
 
@@ -17,3 +24,19 @@ def test_a_cloud_becomes_the_voxels_that_hold_its_points():
     assert len(np.unique(voxels.indices, axis=0)) == len(voxels.indices)
     assert_allclose(voxels.voxel_size, 0.1)
     assert len(stage.surface_voxels(np.zeros((0, 3)), 0.1).indices) == 0
+
+
+def test_key_points_go_with_the_tracks_they_were_followed_in(tmp_path, monkeypatch):
+    monkeypatch.setattr(stage, "clouds", lambda job: "surface")
+    monkeypatch.setattr(stage, "_track", lambda job, capture: job.run.write_npz("tracks.npz") or 1)
+    capture, run = make_capture(tmp_path / "capture"), Run(tmp_path / "run")
+    with threads(1) as executor:
+        job = Job(run, load_config(), executor, capture=capture, fps=capture.fps)
+        stage.tracks(job)
+        for name in (*KEYPOINT_FILES, "keypoints.toml"):
+            (run.path / name).touch()
+        stage.tracks(job)
+        assert all((run.path / name).exists() for name in KEYPOINT_FILES)
+        stage.tracks(Job(run, load_config(), executor, capture=capture, fps=2 * capture.fps))
+    assert not [name for name in KEYPOINT_FILES if (run.path / name).exists()]
+    assert (run.path / "keypoints.toml").exists()

@@ -1,0 +1,81 @@
+"""What a segmentation takes from a run folder that has been used before, and what it leaves there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from geomocap.config import load_config
+from geomocap.export.trc import read_trc
+from geomocap.pipeline import Job, motion_files, segment
+from geomocap.pipeline.derived import KEYPOINT_FILES
+from geomocap.run import Run
+from geomocap.scans import open_scans
+from geomocap.scheduling import threads
+from tests.geomocap.moving_chains import chain
+
+SETTINGS = {"nodes": {"nodes": 30, "coarse_nodes": 20, "points": 300, "coarse_points": 200}}
+M3 = {"segmentation": {"method": "m3", "max_depth": 3}}
+
+
+@pytest.fixture
+def job(tmp_path):
+    """Make the job of scans (T, N, 3) in one and the same run folder."""
+
+    def make(scans: np.ndarray, settings: dict | None = None) -> Job:
+        np.save(tmp_path / "scans.npy", scans)
+        config = load_config(overrides=settings or SETTINGS)
+        return Job(Run(tmp_path / "run"), config, executor, scans=open_scans(tmp_path / "scans.npy", config.scans))
+
+    with threads(1) as executor:
+        yield make
+
+
+def scanned(frames: int) -> np.ndarray:
+    return chain(2, frames, samples=200).positions.swapaxes(0, 1)
+
+
+def test_scans_leave_tracks_of_a_capture_alone(job):
+    scans = job(scanned(6))
+    tracks = np.random.default_rng(0).normal(size=(500, 1, 3)).repeat(6, axis=1)
+    scans.run.write_npz("tracks.npz", positions=tracks, sigma=np.full((500, 6), 0.002))
+    segment(scans, "scans")
+    assert scans.run.read_npz("diagnostics.npz")["paths"] == "nodes"
+
+
+def follow(run: Run, frames: int) -> None:
+    run.write_npz("keypoints.npz", names=np.array(["tip"]), positions=np.zeros((frames, 1, 3)), radius=np.array([0.1]))
+    for name in ("keypoints.toml", "keypoints.trc", "keypoints.c3d"):
+        (run.path / name).touch()
+
+
+def test_key_points_go_with_the_bodies_they_were_followed_on(job):
+    first = job(scanned(6), M3)
+    segment(first, "scans")
+    follow(first.run, 6)
+    motion_files(first, "scans")
+    assert "tip" in read_trc(first.run.path / "motion.trc").names
+    motion_files(job(scanned(5), M3), "scans")
+    assert not [name for name in KEYPOINT_FILES if (first.run.path / name).exists()]
+    assert (first.run.path / "keypoints.toml").exists()
+    assert "tip" not in read_trc(first.run.path / "motion.trc").names
+
+
+def test_motion_files_are_written_anew_with_key_points_followed_since(job):
+    done = job(scanned(6), M3)
+    motion_files(done, "scans")
+    follow(done.run, 6)
+    motion_files(done, "scans")
+    assert "tip" in read_trc(done.run.path / "motion.trc").names
+
+
+def test_one_scan_leaves_no_motion_of_the_sequence_before_it(job):
+    sequence = job(scanned(5), M3)
+    motion_files(sequence, "scans")
+    assert (sequence.run.path / "skeleton.npz").exists() and (sequence.run.path / "motion.bvh").exists()
+    motion_files(job(scanned(5)[:1], M3), "scans")
+    assert not (sequence.run.path / "skeleton.npz").exists()
+    assert not list(sequence.run.path.glob("motion.*"))
+    assert len(sequence.run.read_npz("ellipsoids.npz")["centers"]) == 1
+    motion_files(job(scanned(5), M3), "scans")
+    assert (sequence.run.path / "motion.bvh").exists()
