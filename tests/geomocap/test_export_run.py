@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from geomocap.errors import RunError
+from geomocap.export.bvh import read_bvh
 from geomocap.export.errors import MotionError
 from geomocap.export.names import Names
 from geomocap.export.run_export import FILES, export_run
@@ -92,6 +93,9 @@ def test_one_body_without_joints(tmp_path):
     exported = export_run(run, ["bvh", "trc", "glb", "csv"])
     assert len(exported.files) == 4
     assert read_trc(tmp_path / "motion.trc").names == ("body00",)
+    run.write_npz("ellipsoids.npz", centers=np.zeros((20, 2, 3)), radii=np.full((20, 2, 3), 3.5), body=np.zeros(2))
+    export_run(run, ["bvh"])
+    assert np.linalg.norm(read_bvh(tmp_path / "motion.bvh").tips[0]) == pytest.approx(3.5)
 
 
 def test_up_is_the_captures(run):
