@@ -86,6 +86,15 @@ def test_key_points_and_ellipsoids_are_markers(run):
     assert read_trc(run.path / "motion.trc").names[-1] == "hat"
 
 
+def test_an_ellipsoid_without_points_is_no_marker(run):
+    counts = np.full((20, 2), 30)
+    counts[4:7, 1] = 0
+    run.write_npz("ellipsoids.npz", centers=np.ones((20, 2, 3)), counts=counts, body=np.array([0, 1]))
+    export_run(run, ["trc"])
+    positions = read_trc(run.path / "motion.trc").positions[:, -2:]
+    np.testing.assert_array_equal(np.isfinite(positions).all(axis=-1), counts > 0)
+
+
 def test_one_body_without_joints(tmp_path):
     run = Run(tmp_path)
     arrays = skeleton_arrays(n_bodies=1)
