@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import open3d as o3d
@@ -36,6 +37,7 @@ class ScanSettings(Settings):
         None, gt=0, description="distance of neighbouring points (scan units); measured on the first scan if not given"
     )
     scale: float = Field(1.0, gt=0, description="metres per unit of the scans, 0.001 for millimetres")
+    up: Literal["x", "y", "z"] = Field("z", description="axis of the scans that points up; y in glTF files")
     seed: int = Field(0, ge=0, description="seed of the surface sampling")
 
 

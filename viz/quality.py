@@ -160,9 +160,10 @@ class Paths:
 def relative_paths(ellipsoids: Ellipsoids, diagnostics: dict[str, np.ndarray]) -> Paths:
     """Return the relative paths and distance curves as the M3 paper defines them (section 7)."""
     centers = ellipsoids.centers
-    relative = centers - np.nanmean(centers, axis=0)
+    relative = centers - _mean_over_time(centers)
     weight = ellipsoids.counts[0] if ellipsoids.counts is not None else np.ones(centers.shape[1])
-    middle = np.average(centers[0], axis=0, weights=np.maximum(weight, 1e-9))
+    there = np.isfinite(centers[0]).all(axis=1)
+    middle = np.average(centers[0, there], axis=0, weights=np.maximum(weight[there], 1e-9))
     seeds = np.atleast_1d(diagnostics.get("seeds", np.array([], int)))
     seed = int(seeds[0]) if len(seeds) else int(np.nanargmin(np.linalg.norm(centers[0] - middle, axis=1)))
     distance = np.linalg.norm(relative - relative[:, seed : seed + 1], axis=2)
@@ -170,10 +171,16 @@ def relative_paths(ellipsoids: Ellipsoids, diagnostics: dict[str, np.ndarray]) -
     if integrals is None or np.ndim(integrals) != 2:
         count = relative.shape[1]
         integrals = np.array(
-            [np.nanmean(np.linalg.norm(relative - relative[:, k : k + 1], axis=2), axis=0) for k in range(count)]
+            [_mean_over_time(np.linalg.norm(relative - relative[:, k : k + 1], axis=2)) for k in range(count)]
         )
     threshold = diagnostics.get("threshold")
     return Paths(relative, seed, distance, integrals, None if threshold is None else float(np.ravel(threshold)[0]))
+
+
+def _mean_over_time(values: np.ndarray) -> np.ndarray:
+    """Mean over the frames (T, ...) that have a value; NaN where none has."""
+    number = np.isfinite(values).sum(axis=0)
+    return np.where(number > 0, np.nansum(values, axis=0) / np.maximum(number, 1), np.nan)
 
 
 @dataclass(frozen=True)

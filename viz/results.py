@@ -71,7 +71,10 @@ def ply_count(path: Path) -> int:
 
 @dataclass(frozen=True)
 class Ellipsoids:
-    """`ellipsoids.npz`: centers (T,K,3), radii (T,K,3), rotations (T,K,3,3), counts, errors (T,K), body (K,)."""
+    """`ellipsoids.npz`: centers (T,K,3), radii (T,K,3), rotations (T,K,3,3), counts, errors (T,K), body (K,).
+
+    The centre of an ellipsoid is NaN in the frames in which no points belong to it.
+    """
 
     centers: np.ndarray
     radii: np.ndarray
@@ -249,10 +252,11 @@ class Results:
         data = self._npz("ellipsoids.npz", ("centers", "radii", "rotations"))
         if data is None:
             return None
-        body = data.get("body", np.full(data["centers"].shape[1], -1)).astype(int)
-        return Ellipsoids(
-            data["centers"], data["radii"], data["rotations"], data.get("counts"), data.get("errors"), body
-        )
+        centers, counts = data["centers"], data.get("counts")
+        if counts is not None:
+            centers = np.where(counts[..., None] > 0, centers, np.nan)
+        body = data.get("body", np.full(centers.shape[1], -1)).astype(int)
+        return Ellipsoids(centers, data["radii"], data["rotations"], counts, data.get("errors"), body)
 
     @cached_property
     def skeleton(self) -> Skeleton | None:

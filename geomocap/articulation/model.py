@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geomocap.articulation.kinematics import BodyMotion, Linkage, posed
+from geomocap.articulation.kinematics import BodyMotion, JointMotion, Linkage, body_motion, posed
 from geomocap.articulation.observations import SkinPoints
 from geomocap.errors import GeometryError
 from geomocap.skeleton.hierarchy import Hierarchy
@@ -42,7 +42,8 @@ class SubjectModel:
     joint_hinge : (J,) bool
         Whether a joint turns about its axis only.
     joint_limits : (J, 2, 3) float, radians
-        Least and largest components of the rotation vectors seen, in the parent's axes.
+        Least and largest components of the rotation vectors seen in any take, from the first of `poses` and in the
+        parent's axes there, whatever the rest pose is.
     joint_names : (J,) str
     body_names : (B,) str
     root : int
@@ -52,7 +53,8 @@ class SubjectModel:
     body_extents : (B, 3) float, metres
         Size of each body along its principal axes.
     poses : (K, B, 3, 3) float
-        Turns of the bodies against their parents (of the root: in world axes) in poses that differ most.
+        Turns of the bodies against their parents (of the root: in world axes) in poses that differ most; the first is
+        frame 0 of the first take.
     extent : float, metres
         Diagonal of the box around the subject at rest.
     spacing : float, metres
@@ -141,10 +143,17 @@ class SubjectModel:
             normals=np.einsum("pij,pj->pi", rotations[self.skin.body], self.normals),
             joints=linkage.joints,
             joint_axes=linkage.axes,
-            joint_limits=rotation_limits(poses[:, self.joint_bodies[:, 1]]),
             origin=linkage.origin,
             poses=poses,
         )
+
+    def widened(self, bodies: BodyMotion) -> SubjectModel:
+        """Return the model with limits that hold the turns of a motion, too."""
+        first = body_motion(self.linkage, JointMotion(self.poses[:1], self.origin[None])).rotations[0]
+        parents, children = (bodies.rotations[:, b] @ first[b].swapaxes(1, 2) for b in self.joint_bodies.T)
+        low, high = rotation_limits(parents.swapaxes(2, 3) @ children).swapaxes(0, 1)
+        limits = np.minimum(low, self.joint_limits[:, 0]), np.maximum(high, self.joint_limits[:, 1])
+        return replace(self, joint_limits=np.stack(limits, axis=1))
 
     def arrays(self) -> dict[str, Any]:
         """Return the arrays of `model.npz`."""

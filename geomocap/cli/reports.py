@@ -26,7 +26,7 @@ def review_job(job: Job, made_from: str) -> None:
         Key of the last stage that the report shows.
     """
     code = fingerprint([Path(review.__code__.co_filename).parent])
-    key = stage_key("review", made_from, code, sorted(job.run.read_timings()))
+    key = stage_key("review", made_from, job.up, code, sorted(job.run.read_timings()))
     job.stage("review", key, ["review"], lambda: len(review(job.run, job.capture, progress=job.progress)))
 
 

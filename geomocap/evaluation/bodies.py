@@ -99,7 +99,7 @@ def judge_bodies(run: Run, truth: Truth, frames: Sequence[int]) -> tuple[Evaluat
 
 
 def adjusted_rand_index(a: np.ndarray, b: np.ndarray) -> float:
-    """Agreement of two labellings, (N,) each: 1 if they are the same but for names, about 0 if by chance.
+    """Agreement of two labellings, (N,) each: 1 if they are the same but for names, about 0 if by chance; 0 of nothing.
 
     Hubert & Arabie (1985), Comparing partitions, equation 5.
     """
@@ -108,9 +108,11 @@ def adjusted_rand_index(a: np.ndarray, b: np.ndarray) -> float:
     _, a = np.unique(a, return_inverse=True)
     _, b = np.unique(b, return_inverse=True)
     table = np.zeros((a.max() + 1, b.max() + 1))
+    if table.shape in ((1, 1), (len(a), len(a))):  # both all in one, or each for itself: the formula is 0 / 0
+        return 1.0
     np.add.at(table, (a, b), 1)
     together, in_a, in_b = _pairs(table), _pairs(table.sum(axis=1)), _pairs(table.sum(axis=0))
-    expected = in_a * in_b / (len(a) * (len(a) - 1) / 2) if len(a) > 1 else 0.0
+    expected = in_a * in_b / (len(a) * (len(a) - 1) / 2)
     return float((together - expected) / max((in_a + in_b) / 2 - expected, 1e-12))
 
 

@@ -18,7 +18,7 @@ def judge_skeleton(skeleton: Mapping[str, np.ndarray], truth: Truth, votes: np.n
     """Compare a run's skeleton with the true one.
 
     Joints are matched one to one by their mean distance over time. A true joint counts as found when its partner's mean
-    distance is under a tenth of the height.
+    distance is under a tenth of the height. A skeleton without joints has a recall of 0, and no precision.
 
     Parameters
     ----------
@@ -31,9 +31,8 @@ def judge_skeleton(skeleton: Mapping[str, np.ndarray], truth: Truth, votes: np.n
     positions = skeleton["joint_positions"].astype(float)
     joint_bodies = skeleton["joint_bodies"].astype(int).reshape(-1, 2)
     T = min(len(positions), truth.n_frames)
-    # The joint of a true body to its parent is where its first rig joint lies; the first body is the root.
-    active = np.arange(1, len(truth.bodies))
-    if T == 0 or positions.shape[1] == 0 or len(active) == 0:
+    active = truth.bodies.jointed
+    if T == 0 or len(active) == 0:
         return Evaluation({})
     positions, h = positions[:T], truth.height
     true = truth.joint_positions[:T, truth.bodies.root[active]]
@@ -48,8 +47,9 @@ def judge_skeleton(skeleton: Mapping[str, np.ndarray], truth: Truth, votes: np.n
         "joints.true": len(active),
         "joints.recall_at_10%h": float(good.sum() / len(active)),
         "joints.recall_at_5%h": float((error < WELL_WITHIN * h).sum() / len(active)),
-        "joints.precision_at_10%h": float(good.sum() / positions.shape[1]),
     }
+    if positions.shape[1]:
+        figures["joints.precision_at_10%h"] = float(good.sum() / positions.shape[1])
     curves: list[Curve] = []
     matches: list[Match] = []
     pairs = list(zip(row[good].tolist(), column[good].tolist(), strict=True))
@@ -91,7 +91,7 @@ def _judge_edges(joint_bodies: np.ndarray, truth: Truth, votes: np.ndarray) -> d
     """Which true connections were found; a found body stands for the true one that most of its points lie on."""
     to_true = np.zeros(max(votes.shape[1], int(joint_bodies.max(initial=0)) + 1), int)
     to_true[: votes.shape[1]] = votes.argmax(axis=0)
-    true = {_edge(b, int(truth.bodies.parent[b])) for b in range(1, len(truth.bodies))}
+    true = {_edge(b, int(truth.bodies.parent[b])) for b in truth.bodies.jointed.tolist()}
     found = {_edge(int(to_true[a]), int(to_true[b])) for a, b in joint_bodies}
     wrong = [e for e in found if e not in true and e[0] != e[1]]
     return {
@@ -108,7 +108,7 @@ def _judge_rotations(rotations: np.ndarray, truth: Truth, votes: np.ndarray) -> 
     """Turns since the first frame about world axes, of each true body against the found body that covers it best."""
     T = len(rotations)
     errors, curves = [], []
-    for b in range(1, len(truth.bodies)):
+    for b in truth.bodies.jointed.tolist():
         k = int(votes[b].argmax())
         if votes[b, k] == 0 or k >= rotations.shape[1]:
             continue

@@ -47,6 +47,11 @@ class TrueBodies:
     def __len__(self) -> int:
         return len(self.root)
 
+    @property
+    def jointed(self) -> np.ndarray:
+        """Bodies with a joint to a parent, where its first rig joint lies: all but the roots, int."""
+        return np.flatnonzero(self.parent >= 0)
+
 
 @dataclass(frozen=True)
 class Truth:

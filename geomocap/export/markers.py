@@ -78,6 +78,8 @@ def markers_from_run(
 ) -> Markers:
     """Gather a run's joints, key-points and ellipsoid centres as markers; the bodies' centres if it has none.
 
+    An ellipsoid is missing in the frames in which no points belong to it.
+
     Parameters
     ----------
     skeleton, ellipsoids, keypoints : mapping
@@ -105,8 +107,11 @@ def markers_from_run(
         bodies = [body_names[b] if 0 <= b < n_bodies else "no body" for b in ellipsoids["body"].astype(int)]
         labels += [f"ellipsoid{k:03d}" for k in range(len(bodies))]
         told += [f"centre of an ellipsoid of {b}" for b in bodies]
-        positions.append(ellipsoids["centers"])
-        residuals.append(np.full(ellipsoids["centers"].shape[:2], np.nan))
+        centers = np.asarray(ellipsoids["centers"], float)
+        if "counts" in ellipsoids:
+            centers = np.where(ellipsoids["counts"][..., None] > 0, centers, np.nan)
+        positions.append(centers)
+        residuals.append(np.full(centers.shape[:2], np.nan))
     if not labels:
         labels, told = list(body_names), ["centre of a body"] * n_bodies
         positions = [np.asarray(skeleton["body_positions"])]

@@ -20,7 +20,7 @@ from geomocap.export.model_skin import skin_from_model
 from geomocap.export.motion import Motion
 from geomocap.export.names import Names
 from geomocap.export.settings import ExportSettings
-from geomocap.export.skeleton_motion import motion_from_skeleton
+from geomocap.export.skeleton_motion import UNKNOWN_RADIUS, motion_from_skeleton
 from geomocap.export.skin import skin_from_run
 from geomocap.export.skinned_mesh import SkinnedMesh
 from geomocap.export.tables import motion_table, write_csv, write_parquet
@@ -104,8 +104,9 @@ def export_run(
     if names is None and (run.path / "names.toml").is_file():
         names = Names.read(run.path / "names.toml")
     up = run_up(run)
+    source = str(run.path / "skeleton.npz")
     motion = motion_from_skeleton(
-        skeleton, up=up, names=names, joints=settings.joints, source=str(run.path / "skeleton.npz")
+        skeleton, up=up, names=names, joints=settings.joints, source=source, radius=mean_radius(run)
     )
     markers = run_markers(run, skeleton, names, up, ellipsoids=settings.ellipsoids)
     mesh = surface_of_run(run, motion, settings)
@@ -143,6 +144,12 @@ def run_up(run: Run) -> Axis:
     if up not in axes:
         raise MotionError(f"{run.path / 'run.toml'}: source.up is {up!r}; expected x, y or z")
     return axes[up]
+
+
+def mean_radius(run: Run) -> float:
+    """Return the mean semi-axis of a run's ellipsoids, metres."""
+    shells = run.read_npz("ellipsoids.npz") if (run.path / "ellipsoids.npz").is_file() else {}
+    return float(np.mean(shells["radii"])) if "radii" in shells else UNKNOWN_RADIUS
 
 
 def run_markers(

@@ -22,7 +22,8 @@ from geomocap.export.rotations import fill_positions, fill_rotations
 
 JointMode = Literal["auto", "fixed", "moving"]
 FIXED_WITHIN = 1e-5  # m: a joint that stays this near its mean place in the parent body is fixed; ten add up to 0.1 mm
-SHORTEST_TIP = 1e-3  # m: a bone needs some length to be seen
+SHORTEST_TIP, END_BONE = 0.0005, 0.03  # shares of the skeleton's extent: shorter tips are replaced by end bones
+UNKNOWN_RADIUS = 0.05  # m
 ORIGIN = "origin"
 
 
@@ -33,6 +34,7 @@ def motion_from_skeleton(
     names: Names | None = None,
     joints: JointMode = "auto",
     source: str = "skeleton.npz",
+    radius: float = UNKNOWN_RADIUS,
 ) -> Motion:
     """Make a motion of the arrays of `skeleton.npz`.
 
@@ -52,6 +54,8 @@ def motion_from_skeleton(
         translation in every frame. auto: only those nodes get it that no constant offset reproduces within 0.01 mm.
     source : str
         Name of the file, for messages.
+    radius : float, metres
+        Size of a single body, which a skeleton without joints can't tell; its bone is as long.
 
     Raises
     ------
@@ -71,7 +75,7 @@ def motion_from_skeleton(
         raise MotionError(f"{source}: {error}") from None
 
     rotations = np.stack([fill_rotations(r) for r in skeleton["body_rotations"].swapaxes(0, 1)], axis=1)
-    chain = _Chain(tree, rotations, skeleton["joint_positions"], skeleton["body_positions"], joints)
+    chain = _Chain(tree, rotations, skeleton["joint_positions"], skeleton["body_positions"], joints, up, radius)
     if len(tree.roots) > 1:
         chain.add_origin()
     for body in tree.order.tolist():
@@ -81,7 +85,7 @@ def motion_from_skeleton(
             chain.add_joint(body_names[body], int(tree.parent[body]), body, int(tree.joint[body]))
     for joint, body in tree.extra:
         chain.add_joint(joint_names[joint], body, -1, joint)
-    return chain.motion(float(skeleton["fps"]), up)
+    return chain.motion(float(skeleton["fps"]))
 
 
 def _texts(array: np.ndarray | None) -> list[str] | None:
@@ -140,6 +144,8 @@ class _Chain:
     joint_positions: np.ndarray
     body_positions: np.ndarray
     mode: JointMode
+    up: Axis
+    radius: float
     nodes: list[_Node] = field(default_factory=list)
     node_of_body: dict[int, int] = field(default_factory=dict)
 
@@ -193,7 +199,7 @@ class _Chain:
             self.node_of_body[body] = len(self.nodes)
         self.nodes.append(_Node(name, index, body, joint, moving, local, turn, world, R))
 
-    def motion(self, fps: float, up: Axis) -> Motion:
+    def motion(self, fps: float) -> Motion:
         """Return the finished motion."""
         nodes = self.nodes
         return Motion(
@@ -207,11 +213,16 @@ class _Chain:
             bodies=np.array([n.body for n in nodes]),
             joints=np.array([n.joint for n in nodes]),
             fps=fps,
-            up=up,
+            up=self.up,
         )
 
     def _tips(self) -> np.ndarray:
-        """End of each node without children: its joint mirrored at the body's centre, mean over time."""
+        """End of each node without children: its joint mirrored at the body's centre, mean over time.
+
+        A bone needs some length to be seen: where joint and centre coincide it points up.
+        """
+        extent = self._extent()
+        end = (END_BONE * extent or self.radius) * np.eye(3)["xyz".index(self.up)]
         parents = {n.parent for n in self.nodes}
         tips = np.full((len(self.nodes), 3), np.nan)
         for i, node in enumerate(self.nodes):
@@ -223,6 +234,12 @@ class _Chain:
                 local = np.einsum("tji,tj->ti", node.world_rotation, to_centre)
                 good = np.isfinite(local).all(axis=1)
                 tips[i] = 2 * local[good].mean(axis=0) if good.any() else 0.0
-            if np.linalg.norm(tips[i]) < SHORTEST_TIP:
-                tips[i] = (0.0, 0.0, 0.05)
+            if np.linalg.norm(tips[i]) <= SHORTEST_TIP * extent:
+                tips[i] = end
         return tips
+
+    def _extent(self) -> float:
+        """Diagonal of the box around joints and bodies' centres in the first frame, metres; 0 of a single body."""
+        centers = [fill_positions(p)[0] for p in self.body_positions.swapaxes(0, 1)]
+        places = [node.world_origin[0] for node in self.nodes if node.body >= 0 or node.joint >= 0]
+        return float(np.linalg.norm(np.ptp([*centers, *places], axis=0)))

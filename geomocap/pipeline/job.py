@@ -110,4 +110,4 @@ class Job:
     @property
     def up(self) -> str:
         """The world axis that points up."""
-        return self.capture.info.up if self.capture is not None else "z"
+        return self.capture.info.up if self.capture is not None else self.config.scans.up

@@ -67,7 +67,7 @@ def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) ->
     together = {name: np.stack([getattr(e, name) for e in fitted]) for name in names}
     job.run.write_npz("ellipsoids.npz", **together, body=np.arange(model.body_count, dtype=np.int32))
     job.run.write_npz("skeleton.npz", **_skeleton(model, take, job.fps).arrays())
-    job.run.write_npz(MODEL_FILE, **model.reposed(take.bodies, 0).arrays())
+    job.run.write_npz(MODEL_FILE, **model.widened(take.bodies).reposed(take.bodies, 0).arrays())
     job.run.write_npz(
         "diagnostics.npz",
         paths=np.array("model"),

@@ -1,6 +1,7 @@
 import itertools
 
 import numpy as np
+import open3d as o3d
 import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -55,6 +56,13 @@ def test_adjusted_rand_index_by_counting_pairs():
     a, b = rng.integers(0, 4, 40), rng.integers(-1, 3, 40)
     assert adjusted_rand_index(a, b) == pytest.approx(pair_counting(a, b))
     assert adjusted_rand_index(a, (a + 1) % 4) == pytest.approx(1)
+
+
+def test_equal_labellings_without_contrast_agree():
+    for same in (np.zeros(100, int), np.arange(100), np.zeros(1, int)):
+        assert adjusted_rand_index(same, same + 3) == 1.0
+    assert adjusted_rand_index(np.zeros(100, int), np.arange(100)) == 0.0
+    assert adjusted_rand_index(np.zeros(100, int), np.arange(100) // 50) == 0.0
 
 
 def test_true_bodies_need_fifteen_degrees(tmp_path):
@@ -179,6 +187,38 @@ def test_a_perfect_run_is_perfect(tmp_path):
     assert f["joints.recall_at_5%h"] == f["joints.precision_at_10%h"] == f["skeleton.true_edges_found"] == 1
     assert f["joints.mean_error"] == pytest.approx(0, abs=1e-9)
     assert f["motion.body_rotation_error_deg"] == pytest.approx(0, abs=1e-4)
+    assert f["skeleton.false_edges"] == 0
+
+
+def test_one_body_recalls_no_joint(tmp_path):
+    truth, run = write_truth(tmp_path / "truth"), flawed_run(tmp_path / "run")
+    s = run.read_npz("skeleton.npz")
+    s["joint_positions"], s["joint_bodies"] = s["joint_positions"][:, :0], s["joint_bodies"][:0]
+    s["joint_names"], s["body_rotations"] = s["joint_names"][:0], s["body_rotations"][:, :1]
+    run.write_npz("skeleton.npz", **s)
+    f = evaluate(run.path, truth).figures
+    assert (f["joints.found"], f["joints.true"]) == (0, 3)
+    assert f["joints.recall_at_10%h"] == f["joints.recall_at_5%h"] == f["skeleton.true_edges_found"] == 0
+    assert f["skeleton.false_edges"] == 0
+    assert "joints.precision_at_10%h" not in f
+    for k in run.frames("bodies"):  # all in one body
+        cloud = o3d.t.io.read_point_cloud(str(run.frame_file("bodies", k)))
+        cloud.point["body"] = cloud.point["body"] * 0
+        o3d.t.io.write_point_cloud(str(run.frame_file("bodies", k)), cloud)
+    assert evaluate(run.path, truth).figures["motion.body_rotation_error_deg"] > 10
+
+
+def test_a_perfect_run_of_two_roots_is_perfect(tmp_path):
+    t = truth_arrays()
+    truth = write_truth(tmp_path / "truth", joint_parents=np.array([-1, 0, 1, -1, 3]))
+    run = flawed_run(tmp_path / "run")
+    s = run.read_npz("skeleton.npz")
+    s["joint_positions"], s["joint_bodies"] = t["joint_positions"][:, [1, 2]], np.array([[0, 1], [1, 2]])
+    s["joint_names"] = s["joint_names"][:2]
+    run.write_npz("skeleton.npz", **s)
+    f = evaluate(run.path, truth).figures
+    assert (f["truth.bodies"], f["joints.true"]) == (4, 2)
+    assert f["joints.recall_at_5%h"] == f["joints.precision_at_10%h"] == f["skeleton.true_edges_found"] == 1
     assert f["skeleton.false_edges"] == 0
 
 

@@ -58,6 +58,27 @@ def test_a_body_without_joints():
     np.testing.assert_allclose(motion.forward_kinematics()[1][:, 0], arrays["body_positions"][:, 0])
 
 
+@pytest.mark.parametrize("size", [0.05, 1.0, 20.0])
+@pytest.mark.parametrize("up", ["x", "y", "z"])
+def test_end_bones_are_as_large_as_the_subject_and_point_up(size, up):
+    arrays = skeleton_arrays()
+    leaf = int(np.setdiff1d(arrays["joint_bodies"][:, 1], arrays["joint_bodies"][:, 0])[0])
+    joint = int(np.flatnonzero(arrays["joint_bodies"][:, 1] == leaf)[0])
+    arrays["body_positions"][:, leaf] = arrays["joint_positions"][:, joint]
+    whole = motion_from_skeleton(arrays, up=up)
+    arrays |= {k: size * arrays[k] for k in ("joint_positions", "body_positions")}
+    motion = motion_from_skeleton(arrays, up=up)
+    np.testing.assert_allclose(motion.tips, size * whole.tips)
+    tip = motion.tips[motion.bodies.tolist().index(leaf)]
+    assert tip @ np.eye(3)["xyz".index(up)] == pytest.approx(np.linalg.norm(tip))
+    assert 0.01 * size < np.linalg.norm(tip) < 0.1 * size
+
+
+def test_a_single_body_has_a_bone_of_its_own_size():
+    motion = motion_from_skeleton(skeleton_arrays(n_bodies=1), up="y", radius=0.004)
+    np.testing.assert_allclose(motion.tips, [[0, 0.004, 0]])
+
+
 def test_a_joint_that_closes_a_loop_is_kept():
     arrays = skeleton_arrays(n_bodies=3)
     parent, child = arrays["joint_bodies"][0]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from geomocap.errors import RunError, SettingsError
+from geomocap.export.bvh import read_bvh
 from geomocap.export.errors import MotionError
 from geomocap.export.names import Names
 from geomocap.export.run_export import FILES, export_run
@@ -85,6 +86,15 @@ def test_key_points_and_ellipsoids_are_markers(run):
     assert read_trc(run.path / "motion.trc").names[-1] == "hat"
 
 
+def test_an_ellipsoid_without_points_is_no_marker(run):
+    counts = np.full((20, 2), 30)
+    counts[4:7, 1] = 0
+    run.write_npz("ellipsoids.npz", centers=np.ones((20, 2, 3)), counts=counts, body=np.array([0, 1]))
+    export_run(run, ["trc"])
+    positions = read_trc(run.path / "motion.trc").positions[:, -2:]
+    np.testing.assert_array_equal(np.isfinite(positions).all(axis=-1), counts > 0)
+
+
 def test_one_body_without_joints(tmp_path):
     run = Run(tmp_path)
     arrays = skeleton_arrays(n_bodies=1)
@@ -92,6 +102,9 @@ def test_one_body_without_joints(tmp_path):
     exported = export_run(run, ["bvh", "trc", "glb", "csv"])
     assert len(exported.files) == 4
     assert read_trc(tmp_path / "motion.trc").names == ("body00",)
+    run.write_npz("ellipsoids.npz", centers=np.zeros((20, 2, 3)), radii=np.full((20, 2, 3), 3.5), body=np.zeros(2))
+    export_run(run, ["bvh"])
+    assert np.linalg.norm(read_bvh(tmp_path / "motion.bvh").tips[0]) == pytest.approx(3.5)
 
 
 def test_up_is_the_captures(run):

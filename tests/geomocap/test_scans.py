@@ -7,9 +7,15 @@ import open3d as o3d
 import pytest
 import trimesh
 
+from geomocap.config import load_config
 from geomocap.errors import GeometryError
+from geomocap.export.run_export import run_up
 from geomocap.geometry import Voxels
+from geomocap.pipeline.job import Job
+from geomocap.pipeline.sources import geometry_of
+from geomocap.run import Run
 from geomocap.scans import ScanSettings, open_scans
+from geomocap.scheduling import threads
 
 
 @pytest.mark.parametrize("ending", ["ply", "obj", "stl", "glb"])
@@ -55,6 +61,21 @@ def test_spacing_is_the_mean_distance_to_the_nearest_point(tmp_path):
     np.save(tmp_path / "g.npy", x)
     assert open_scans(tmp_path / "g.npy", ScanSettings()).spacing == pytest.approx(0.02)
     assert open_scans(tmp_path / "g.npy", ScanSettings(spacing=5, scale=0.001)).spacing == pytest.approx(0.005)
+
+
+def test_up_is_recorded_and_changes_no_points(tmp_path):
+    np.save(tmp_path / "s.npy", np.random.default_rng(0).normal(size=(20, 3)))
+    keys = set()
+    with threads(1) as executor:
+        for up in ("x", "y", "z"):
+            config = load_config(overrides={"scans": {"up": up}})
+            job = Job(Run(tmp_path / up), config, executor, scans=open_scans(tmp_path / "s.npy", config.scans))
+            job.write_record()
+            assert job.up == run_up(job.run) == up
+            assert load_config(tmp_path / up / "run.toml").scans.up == up
+            keys.add(geometry_of(job, "scans")[1])
+    assert len(keys) == 1
+    assert ScanSettings().up == "z"
 
 
 def test_bad_scans_are_named(tmp_path):

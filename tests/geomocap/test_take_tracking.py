@@ -4,7 +4,7 @@ from scipy.spatial.transform import Rotation
 
 from geomocap.articulation.adjustment import adjust
 from geomocap.articulation.kinematics import BodyMotion, JointMotion, body_motion, posed, since
-from geomocap.articulation.model import SubjectModel, rotation_limits
+from geomocap.articulation.model import SubjectModel, read_model, rotation_limits
 from geomocap.articulation.observations import Observations
 from geomocap.articulation.pose_search import find_pose
 from geomocap.articulation.smoothness import PosePrior
@@ -242,6 +242,27 @@ def test_model_in_another_rest_pose_moves_alike(model):
     np.testing.assert_allclose(turned, before, atol=1e-12)
 
 
+def test_limits_are_those_of_all_takes(model):
+    def turning(low, high):
+        """The arm turns about its axis from one angle to another, the head tilts, the trunk turns on the spot."""
+        turns = np.zeros((9, 3, 3))
+        turns[:, 0, 2] = np.linspace(0.5, 1.5, 9)
+        turns[:, 1, 1] = np.linspace(low, high, 9)
+        turns[:, 2, 0] = 0.3
+        local = Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix().reshape(9, 3, 3, 3)
+        return body_motion(model.linkage, JointMotion(local, np.tile(model.origin, (9, 1))))
+
+    still = body_motion(model.linkage, JointMotion(model.poses[:1], model.origin[None]))
+    np.testing.assert_array_equal(model.reposed(still, 0).joint_limits, model.joint_limits)
+    second, third = turning(-0.3, 0.8), turning(-1.1, 0.2)
+    again = model.widened(second).reposed(second, 4)
+    np.testing.assert_allclose(again.joint_limits[0], [[0, -0.6, 0], [0, 0.8, 0]], atol=1e-9)
+    carried = BodyMotion(third.rotations @ second.rotations[4].swapaxes(1, 2), third.translations)  # from its rest
+    last = again.widened(carried).reposed(carried, 8)
+    np.testing.assert_allclose(last.joint_limits[0], [[0, -1.1, 0], [0, 0.8, 0]], atol=1e-9)
+    np.testing.assert_allclose(last.joint_limits[1], [[0, 0, 0], [0.3, 0, 0]], atol=1e-9)
+
+
 def test_stage_follows_the_model_and_says_when_it_fits_poorly(model, tmp_path):
     _, places = take_of(model, 3)
     Run(tmp_path / "first").write_npz("model.npz", **model.arrays())
@@ -260,4 +281,6 @@ def test_stage_follows_the_model_and_says_when_it_fits_poorly(model, tmp_path):
     assert skeleton["joint_names"].tolist() == ["shoulder", "neck"]
     assert skeleton["body_rotations"].shape == (3, 3, 3, 3)
     np.testing.assert_allclose(skeleton["body_rotations"][0], np.tile(np.eye(3), (3, 1, 1)), atol=1e-12)
-    assert (tmp_path / "good/bodies/000002.ply").is_file() and (tmp_path / "good/model.npz").is_file()
+    assert (tmp_path / "good/bodies/000002.ply").is_file()
+    limits = read_model(tmp_path / "good/model.npz").joint_limits  # the arm was seen to turn by -0.6, and now -1
+    assert limits[0, 0, 1] == pytest.approx(-1.0, abs=0.1) and limits[0, 1, 1] == 0

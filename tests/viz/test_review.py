@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from geomocap.errors import GeometryError, RunError
 from geomocap.run import Run
 from tests.viz.conftest import LIMBS, Made
-from viz import render_file, review
+from viz import render_file, review, scene
 from viz.drawing import write_png
 from viz.figures import joint_angles
 from viz.quality import assess, coverage, relative_paths
@@ -214,6 +214,24 @@ def test_relative_paths_of_one_body_have_no_distance(made: Made) -> None:
     np.testing.assert_allclose(paths.distance[:, 0], 0, atol=1e-12)
     np.testing.assert_allclose(np.diag(paths.integrals), 0)
     assert paths.integrals[10, 3] > 0.005
+
+
+def test_ellipsoids_without_points_are_not_drawn(made: Made, tmp_path: Path) -> None:
+    arrays = made.run.read_npz("ellipsoids.npz")
+    counts = np.ones(arrays["centers"].shape[:2], int)
+    counts[:2, 3] = counts[:, 4] = 0
+    arrays["counts"], arrays["centers"][counts == 0] = counts, 50.0
+    run = Run(tmp_path)
+    run.write_npz("ellipsoids.npz", **arrays)
+    results = Results(run)
+    e = results.ellipsoids
+    assert e is not None
+    assert np.abs(results.any_points(0)).max() < 10
+    assert np.abs(scene.ellipsoids(results, 0).vertices).max() < 10
+    assert np.abs(scene.paths(results, 1.7).vertices).max() < 10
+    relative = relative_paths(e, {})
+    assert np.isnan(relative.distance[:2, 3]).all() and np.isfinite(relative.distance[2:, 3]).all()
+    assert np.isfinite(relative.integrals[3, 5]) and np.isnan(relative.integrals[4]).all()
 
 
 def test_video_camera_looks_at_the_broad_side(made: Made) -> None:
