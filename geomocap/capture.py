@@ -10,6 +10,7 @@ bar/<camera>/000000.png          optional reference-bar recording
 
 from __future__ import annotations
 
+import os
 import threading
 import tomllib
 from collections import OrderedDict
@@ -26,11 +27,12 @@ from pydantic import Field, ValidationError
 
 from geomocap.cameras import Rig
 from geomocap.errors import CaptureError
-from geomocap.files import fingerprint, write_text
+from geomocap.files import fingerprint, links, write_text
 from geomocap.settings import Settings
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
 VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+PARTS = ("capture.toml", "images", "videos", "background", "masks", "sparse", "bar", "reference")
 
 
 class CaptureInfo(Settings):
@@ -202,11 +204,12 @@ class Capture:
         Raises
         ------
         CaptureError
-            If it isn't one: no capture.toml, a camera folder missing, frame counts that differ.
+            If it isn't one: no capture.toml, a camera folder missing, frame counts that differ, a link that leads out.
         """
         path = Path(path)
         if not path.is_dir():
             raise CaptureError(f"{path}: no such capture folder")
+        check_links(path)
         info = read_capture_info(path)
         found = _find_sources(path)
         if not found:
@@ -298,6 +301,14 @@ class Capture:
         return fingerprint([self.path / "capture.toml", *(self.path / p for p in parts)])
 
 
+def check_links(path: Path) -> None:
+    """Raise CaptureError if a symbolic link leads out of a capture folder."""
+    root = os.path.realpath(path)
+    for link in (found for part in PARTS for found in links(path / part, depth=2)):
+        if not Path(os.path.realpath(link)).is_relative_to(root):
+            raise CaptureError(f"{link}: leads out of the capture folder; replace the link by what it stands for")
+
+
 def read_capture_info(path: Path) -> CaptureInfo:
     """Read and check `capture.toml` of a capture folder."""
     file = path / "capture.toml"
@@ -322,7 +333,6 @@ def write_capture_info(path: Path, info: CaptureInfo) -> None:
 
 def _find_sources(path: Path) -> dict[str, FrameSource]:
     sources: dict[str, FrameSource] = {}
-    root = path.resolve()
     for folder in sorted(p for p in (path / "images").glob("*") if p.is_dir()):
         files = tuple(sorted(f for f in folder.iterdir() if f.suffix.lower() in IMAGE_ENDINGS))
         for k, file in enumerate(files):
@@ -334,8 +344,4 @@ def _find_sources(path: Path) -> dict[str, FrameSource]:
     for file in sorted((path / "videos").glob("*")):
         if file.suffix.lower() in VIDEO_ENDINGS and file.stem not in sources:
             sources[file.stem] = Video(file)
-    for name, source in sources.items():
-        first = source.files[0] if isinstance(source, ImageFolder) else source.path  # type: ignore[attr-defined]
-        if not first.resolve().is_relative_to(root):
-            raise CaptureError(f"{first}: leads out of the capture folder; copy the files of camera {name} into it")
     return sources

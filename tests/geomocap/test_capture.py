@@ -126,12 +126,43 @@ def test_wrong_capture_toml(tmp_path, text, said):
         Capture.open(tmp_path)
 
 
-def test_paths_can_not_lead_out_of_the_capture(tmp_path):
-    inside, outside = tmp_path / "capture", tmp_path / "outside"
-    make_capture(inside)
-    make_capture(outside)
-    (inside / "images/cam9").symlink_to(outside / "images/cam0")
-    with pytest.raises(CaptureError, match="leads out of the capture folder"):
+@pytest.mark.parametrize(
+    "part",
+    [
+        "images/cam9",
+        "images/cam1/000002.png",
+        "videos/cam9.mp4",
+        "background/cam1.png",
+        "masks",
+        "masks/cam1",
+        "masks/cam1/000000.png",
+        "sparse",
+        "sparse/cameras.txt",
+        "capture.toml",
+        "bar/cam1",
+    ],
+)
+def test_links_can_not_lead_out_of_the_capture(tmp_path, part):
+    inside, outside = make_capture(tmp_path / "capture"), tmp_path / "outside"
+    link = inside / part
+    outside.mkdir()
+    link.parent.mkdir(parents=True, exist_ok=True)
+    if link.exists():
+        link.rename(outside / link.name)
+    link.symlink_to(outside / link.name)
+    with pytest.raises(CaptureError, match=f"{part}: leads out of the capture folder"):
+        Capture.open(inside)
+
+
+def test_links_within_the_capture_are_followed(tmp_path):
+    inside = make_capture(tmp_path / "capture")
+    (inside / "images/cam1").rename(inside / "raw")
+    (inside / "images/cam1").symlink_to("../raw")
+    (tmp_path / "name").symlink_to(inside)
+    np.testing.assert_array_equal(Capture.open(tmp_path / "name").frame("cam1", 2), picture(1, 2))
+    (inside / "raw/000002.png").unlink()
+    (inside / "raw/000002.png").symlink_to(tmp_path / "elsewhere.png")
+    with pytest.raises(CaptureError, match=r"cam1/000002\.png: leads out of the capture folder"):
         Capture.open(inside)
 
 
