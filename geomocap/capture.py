@@ -28,6 +28,7 @@ from pydantic import Field, ValidationError
 from geomocap.cameras import Rig
 from geomocap.errors import CaptureError
 from geomocap.files import fingerprint, links, write_text
+from geomocap.image_headers import damaged, image_size, is_whole, missing
 from geomocap.settings import Settings
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
@@ -54,6 +55,11 @@ class FrameSource(Protocol):
 
     def __len__(self) -> int: ...
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the frames, pixels."""
+        ...
+
     def read(self, frame: int) -> np.ndarray:
         """Return frame `frame` as (H, W, 3) uint8, RGB."""
         ...
@@ -70,12 +76,8 @@ def read_image(path: Path, *, gray: bool = False, alpha: bool = False) -> np.nda
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise CaptureError(f"{path}: can't be read ({error.strerror}); every camera needs every frame") from None
-    whole = not (
-        (data[:8] == b"\x89PNG\r\n\x1a\n" and b"IEND" not in data[-64:])
-        or (data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-4096:])
-    )
-    if whole and data:
+        raise missing(path, error) from None
+    if is_whole(data, data):
         mode = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_UNCHANGED if alpha else cv2.IMREAD_COLOR_RGB
         image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
         if alpha and image is not None:
@@ -85,7 +87,7 @@ def read_image(path: Path, *, gray: bool = False, alpha: bool = False) -> np.nda
             image = cv2.cvtColor(image, conversion)
         if image is not None:
             return image
-    raise CaptureError(f"{path}: truncated or no image ({len(data)} bytes); write it again")
+    raise damaged(path, len(data))
 
 
 @dataclass(frozen=True)
@@ -97,9 +99,24 @@ class ImageFolder:
     def __len__(self) -> int:
         return len(self.files)
 
+    @cached_property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the first frame, pixels; all others must have it."""
+        return image_size(self.files[0])
+
     def read(self, frame: int) -> np.ndarray:
         """Return frame `frame` as (H, W, 3) uint8, RGB."""
-        return read_image(self.files[frame])
+        image = read_image(self.files[frame])
+        self.check_size(frame, (image.shape[1], image.shape[0]))
+        return image
+
+    def check_size(self, frame: int, size: tuple[int, int]) -> None:
+        """Raise CaptureError if a frame has not the size of the first one."""
+        if size != self.size:
+            raise CaptureError(
+                f"{self.files[frame]}: {_show(size)} pixels, but {self.files[0].name} is {_show(self.size)}; all "
+                "frames of a camera need the same size: write the wrong one again"
+            )
 
 
 @dataclass
@@ -138,6 +155,12 @@ class Video:
 
     def __len__(self) -> int:
         return len(self._times)
+
+    @cached_property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the frames, pixels."""
+        height, width = self.read(0).shape[:2]
+        return width, height
 
     def read(self, frame: int) -> np.ndarray:
         """Return frame `frame` as (H, W, 3) uint8, RGB."""
@@ -288,10 +311,11 @@ class Capture:
             raise CaptureError(f"{self.path}: not calibrated, no folder sparse/; run `geomocap calibrate {self.path}`")
         rig = Rig.read(self.path / "sparse", self.cameras)
         for name, (w, h) in zip(rig.names, rig.sizes, strict=True):
-            height, width = self.frame(name, 0).shape[:2]
-            if (width, height) != (w, h):
+            size = self.sources[name].size
+            if size != (w, h):
+                self.frame(name, self.n_frames - 1)  # a first frame unlike the others is no reason to calibrate again
                 raise CaptureError(
-                    f"{self.path}: images of camera {name} are {width}×{height}, but it is calibrated for {w}×{h}; "
+                    f"{self.path}: images of camera {name} are {_show(size)}, but it is calibrated for {w}×{h}; "
                     "calibrate again, or import with the tool that made the calibration"
                 )
         return rig
@@ -345,3 +369,7 @@ def _find_sources(path: Path) -> dict[str, FrameSource]:
         if file.suffix.lower() in VIDEO_ENDINGS and file.stem not in sources:
             sources[file.stem] = Video(file)
     return sources
+
+
+def _show(size: tuple[int, int]) -> str:
+    return f"{size[0]}×{size[1]}"

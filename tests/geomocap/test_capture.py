@@ -9,6 +9,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from geomocap.capture import Capture, CaptureInfo, Video, write_capture_info
 from geomocap.errors import CaptureError
@@ -108,6 +109,29 @@ def test_image_size_against_calibration(tmp_path):
         cv2.imwrite(str(tmp_path / f"images/cam2/{k:06d}.png"), np.zeros((200, 320, 3), np.uint8))
     with pytest.raises(CaptureError, match="camera cam2 are 320×200, but it is calibrated for 320×240"):
         _ = Capture.open(tmp_path).rig
+
+
+@pytest.mark.parametrize(("odd", "named"), [(3, 3), (0, 3)])
+def test_a_frame_of_another_size(tmp_path, odd, named):
+    make_capture(tmp_path)
+    cv2.imwrite(str(tmp_path / f"images/cam2/{odd:06d}.png"), np.zeros((60, 160, 3), np.uint8))
+    capture = Capture.open(tmp_path)
+    with pytest.raises(CaptureError, match=rf"cam2/{named:06d}\.png: \d+×\d+ pixels, but 000000\.png is"):
+        capture.frame("cam2", 3)
+    if odd == 0:
+        with pytest.raises(CaptureError, match="all frames of a camera need the same size"):
+            _ = capture.rig
+
+
+def test_a_turned_photograph_has_the_size_as_it_is_read(tmp_path):
+    make_capture(tmp_path, cameras=1, frames=1)
+    (tmp_path / "images/cam0/000000.png").unlink()
+    turn = Image.Exif()
+    turn[0x0112] = 6
+    Image.fromarray(picture(0, 0)).save(tmp_path / "images/cam0/000000.jpg", exif=turn)
+    capture = Capture.open(tmp_path)
+    assert capture.frame("cam0", 0).shape == (320, 240, 3)
+    assert capture.sources["cam0"].size == (240, 320)
 
 
 @pytest.mark.parametrize(
