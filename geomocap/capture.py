@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 import av
-import cv2
 import numpy as np
 import tomli_w
 from pydantic import Field, ValidationError
@@ -28,10 +27,9 @@ from pydantic import Field, ValidationError
 from geomocap.cameras import Rig
 from geomocap.errors import CaptureError
 from geomocap.files import fingerprint, links, write_text
-from geomocap.image_headers import damaged, image_size, is_whole, missing
+from geomocap.image_files import IMAGE_ENDINGS, ImageFolder, read_image, size_text
 from geomocap.settings import Settings
 
-IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
 VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 PARTS = ("capture.toml", "images", "videos", "background", "masks", "sparse", "bar", "reference")
 
@@ -63,60 +61,6 @@ class FrameSource(Protocol):
     def read(self, frame: int) -> np.ndarray:
         """Return frame `frame` as (H, W, 3) uint8, RGB."""
         ...
-
-
-def read_image(path: Path, *, gray: bool = False, alpha: bool = False) -> np.ndarray:
-    """Read an image file as (H, W, 3) uint8 RGB, as (H, W) uint8 if `gray`, as (H, W, 4) RGBA if `alpha`.
-
-    Raises
-    ------
-    CaptureError
-        If the file is missing, truncated or no image.
-    """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise missing(path, error) from None
-    if is_whole(data, data):
-        mode = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_UNCHANGED if alpha else cv2.IMREAD_COLOR_RGB
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
-        if alpha and image is not None:
-            conversion = {2: cv2.COLOR_GRAY2RGBA, 4: cv2.COLOR_BGRA2RGBA}.get(
-                image.shape[2] if image.ndim == 3 else 2, cv2.COLOR_BGR2RGBA
-            )
-            image = cv2.cvtColor(image, conversion)
-        if image is not None:
-            return image
-    raise damaged(path, len(data))
-
-
-@dataclass(frozen=True)
-class ImageFolder:
-    """Frames of one camera as numbered image files."""
-
-    files: tuple[Path, ...]
-
-    def __len__(self) -> int:
-        return len(self.files)
-
-    @cached_property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the first frame, pixels; all others must have it."""
-        return image_size(self.files[0])
-
-    def read(self, frame: int) -> np.ndarray:
-        """Return frame `frame` as (H, W, 3) uint8, RGB."""
-        image = read_image(self.files[frame])
-        self.check_size(frame, (image.shape[1], image.shape[0]))
-        return image
-
-    def check_size(self, frame: int, size: tuple[int, int]) -> None:
-        """Raise CaptureError if a frame has not the size of the first one."""
-        if size != self.size:
-            raise CaptureError(
-                f"{self.files[frame]}: {_show(size)} pixels, but {self.files[0].name} is {_show(self.size)}; all "
-                "frames of a camera need the same size: write the wrong one again"
-            )
 
 
 @dataclass
@@ -285,11 +229,37 @@ class Capture:
         """Whether the capture brings its own silhouettes."""
         return (self.path / "masks").is_dir()
 
+    def mask_file(self, camera: str, frame: int) -> Path:
+        """Return where a given silhouette is, if the capture brings its own."""
+        return self.path / "masks" / camera / f"{frame:06d}.png"
+
     def mask(self, camera: str, frame: int) -> np.ndarray:
-        """Read a given silhouette: (H, W) uint8, 0 or 255."""
-        return np.where(read_image(self.path / "masks" / camera / f"{frame:06d}.png", gray=True) > 127, 255, 0).astype(
-            np.uint8
-        )
+        """Read a given silhouette: (H, W) uint8, 0 or 255.
+
+        Raises
+        ------
+        CaptureError
+            If it is missing, has not the size of the images, or other values than these two mark the subject.
+        """
+        file = self.mask_file(camera, frame)
+        values = read_image(file, gray=True)
+        self.check_mask_size(camera, frame, (values.shape[1], values.shape[0]))
+        mask = np.where(values > 127, 255, 0).astype(np.uint8)
+        if values.any() and not mask.any():
+            raise CaptureError(
+                f"{file}: its values go up to {values.max()} only; expected 0 for background and 255 for the subject: "
+                "write it with these"
+            )
+        return mask
+
+    def check_mask_size(self, camera: str, frame: int, size: tuple[int, int]) -> None:
+        """Raise CaptureError if a given silhouette has not the size of the camera's images."""
+        wanted = self.sources[camera].size
+        if size != wanted:
+            raise CaptureError(
+                f"{self.mask_file(camera, frame)}: {size_text(size)} pixels, but the images of camera {camera} are "
+                f"{size_text(wanted)}; write the mask in that size"
+            )
 
     @property
     def is_calibrated(self) -> bool:
@@ -315,7 +285,7 @@ class Capture:
             if size != (w, h):
                 self.frame(name, self.n_frames - 1)  # a first frame unlike the others is no reason to calibrate again
                 raise CaptureError(
-                    f"{self.path}: images of camera {name} are {_show(size)}, but it is calibrated for {w}×{h}; "
+                    f"{self.path}: images of camera {name} are {size_text(size)}, but it is calibrated for {w}×{h}; "
                     "calibrate again, or import with the tool that made the calibration"
                 )
         return rig
@@ -369,7 +339,3 @@ def _find_sources(path: Path) -> dict[str, FrameSource]:
         if file.suffix.lower() in VIDEO_ENDINGS and file.stem not in sources:
             sources[file.stem] = Video(file)
     return sources
-
-
-def _show(size: tuple[int, int]) -> str:
-    return f"{size[0]}×{size[1]}"

@@ -123,6 +123,29 @@ def test_a_frame_of_another_size(tmp_path, odd, named):
             _ = capture.rig
 
 
+@pytest.mark.parametrize(
+    ("mask", "said"),
+    [
+        (np.full((60, 80), 255, np.uint8), "80×60 pixels, but the images of camera cam1 are 320×240"),
+        (np.eye(240, 320, dtype=np.uint8), "its values go up to 1 only; expected 0 for background and 255"),
+    ],
+)
+def test_a_given_mask_that_can_not_be_used(tmp_path, mask, said):
+    capture = Capture.open(make_capture(tmp_path))
+    file = tmp_path / "masks/cam1/000001.png"
+    file.parent.mkdir(parents=True)
+    cv2.imwrite(str(file), mask)
+    with pytest.raises(CaptureError, match=rf"masks/cam1/000001\.png: {said}"):
+        capture.mask("cam1", 1)
+
+
+def test_a_given_mask_may_be_empty(tmp_path):
+    capture = Capture.open(make_capture(tmp_path))
+    (tmp_path / "masks/cam1").mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / "masks/cam1/000001.png"), np.zeros((240, 320), np.uint8))
+    assert not capture.mask("cam1", 1).any()
+
+
 def test_a_turned_photograph_has_the_size_as_it_is_read(tmp_path):
     make_capture(tmp_path, cameras=1, frames=1)
     (tmp_path / "images/cam0/000000.png").unlink()
