@@ -22,7 +22,7 @@ from typing import Literal, Protocol
 import av
 import numpy as np
 import tomli_w
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 
 from geomocap.cameras import Rig
 from geomocap.errors import CaptureError
@@ -33,6 +33,8 @@ from geomocap.settings import Settings
 VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 PARTS = ("capture.toml", "images", "videos", "background", "masks", "sparse", "bar", "reference")
 
+Point = tuple[float, float, float]
+
 
 class CaptureInfo(Settings):
     """What `capture.toml` says."""
@@ -40,12 +42,29 @@ class CaptureInfo(Settings):
     name: str = Field("capture", description="name of the recording")
     fps: float = Field(gt=0, description="frames per second")
     length_unit: Literal["m"] = Field("m", description="unit of the calibration")
-    up: Literal["x", "y", "z"] = Field("z", description="world axis that points up")
+    up: Literal["y", "z"] = Field("z", description="world axis that points up")
     cameras: tuple[str, ...] | None = Field(None, description="the cameras to use, in this order; all if not given")
     template_camera: str | None = Field(None, description="camera whose images are the templates of matching")
-    region_of_interest: tuple[tuple[float, float, float], tuple[float, float, float]] | None = Field(
+    region_of_interest: tuple[Point, Point] | None = Field(
         None, description="corners (min, max) of the working volume, metres, world"
     )
+
+    @field_validator("cameras")
+    @classmethod
+    def _each_once(cls, names: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        for k, name in enumerate(names or ()):
+            if names and name in names[:k]:
+                raise ValueError(f"camera {name} is there more than once; name each camera once")
+        return names
+
+    @field_validator("region_of_interest")
+    @classmethod
+    def _min_below_max(cls, box: tuple[Point, Point] | None) -> tuple[Point, Point] | None:
+        if box is not None and not all(low < high for low, high in zip(*box, strict=True)):
+            raise ValueError(
+                f"expected the corners (min, max), got {list(box[0])} and {list(box[1])}; each max must exceed its min"
+            )
+        return box
 
 
 class FrameSource(Protocol):
@@ -171,7 +190,8 @@ class Capture:
         Raises
         ------
         CaptureError
-            If it isn't one: no capture.toml, a camera folder missing, frame counts that differ, a link that leads out.
+            If it isn't one: no capture.toml or a wrong one, a camera folder missing, frame counts that differ, a link
+            that leads out.
         """
         path = Path(path)
         if not path.is_dir():
@@ -187,6 +207,11 @@ class Capture:
                 raise CaptureError(
                     f"{path}: camera {name} of capture.toml has no folder images/{name} and no video videos/{name}.mp4"
                 )
+        if info.template_camera is not None and info.template_camera not in names:
+            raise CaptureError(
+                f"{path / 'capture.toml'}: template_camera: there is no camera {info.template_camera}; "
+                f"choose one of {', '.join(names)}"
+            )
         counts = {n: len(found[n]) for n in names}
         if len(set(counts.values())) > 1:
             listed = ", ".join(f"{n}: {c}" for n, c in counts.items())
@@ -317,7 +342,8 @@ def read_capture_info(path: Path) -> CaptureInfo:
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(p) for p in first["loc"])
-        raise CaptureError(f"{file}: {key}: {first['msg']}; see README, section Captures") from None
+        message = first["msg"].removeprefix("Value error, ")
+        raise CaptureError(f"{file}: {key}: {message}; see README, section Captures") from None
 
 
 def write_capture_info(path: Path, info: CaptureInfo) -> None:

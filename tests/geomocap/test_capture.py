@@ -164,12 +164,17 @@ def test_a_turned_photograph_has_the_size_as_it_is_read(tmp_path):
         ("name = 'x'", "fps: Field required"),
         ("fps = 30\nspeed = 3", "speed: Extra inputs"),
         ("fps = ", "not valid TOML"),
+        ("fps = 30\nup = 'x'", "up: Input should be 'y' or 'z'"),
+        ("fps = 30\ncameras = ['cam1', 'cam1']", "cameras: camera cam1 is there more than once"),
+        ("fps = 30\nregion_of_interest = [[0, 1, 0], [1, 0, 1]]", "region_of_interest: expected the corners"),
+        ("fps = 30\ntemplate_camera = 'nix'", "template_camera: there is no camera nix; choose one of cam0, cam1"),
+        ("fps = 30\ncameras = ['cam0']\ntemplate_camera = 'cam1'", "template_camera: there is no camera cam1"),
     ],
 )
 def test_wrong_capture_toml(tmp_path, text, said):
     make_capture(tmp_path)
     (tmp_path / "capture.toml").write_text(text)
-    with pytest.raises(CaptureError, match=said):
+    with pytest.raises(CaptureError, match=rf"capture\.toml: {said}"):
         Capture.open(tmp_path)
 
 
