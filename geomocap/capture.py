@@ -239,11 +239,19 @@ class Capture:
         return self._background_file(camera) is not None
 
     def background(self, camera: str) -> np.ndarray:
-        """Read the empty background picture of a camera: (H, W, 4) uint8, RGBA, alpha 0 where it is not known."""
+        """Read the empty background picture of a camera: (H, W, 4) uint8, RGBA, alpha 0 where it is not known.
+
+        Raises
+        ------
+        CaptureError
+            If it is missing or has not the size of the images.
+        """
         file = self._background_file(camera)
         if file is None:
             raise CaptureError(f"{self.path}: no background/{camera}.png")
-        return read_image(file, alpha=True)
+        image = read_image(file, alpha=True)
+        self._check_size(file, camera, (image.shape[1], image.shape[0]), "take it with the settings of the recording")
+        return image
 
     def _background_file(self, camera: str) -> Path | None:
         files = [self.path / "background" / f"{camera}{e}" for e in IMAGE_ENDINGS]
@@ -279,11 +287,13 @@ class Capture:
 
     def check_mask_size(self, camera: str, frame: int, size: tuple[int, int]) -> None:
         """Raise CaptureError if a given silhouette has not the size of the camera's images."""
+        self._check_size(self.mask_file(camera, frame), camera, size, "write the mask in that size")
+
+    def _check_size(self, file: Path, camera: str, size: tuple[int, int], remedy: str) -> None:
         wanted = self.sources[camera].size
         if size != wanted:
             raise CaptureError(
-                f"{self.mask_file(camera, frame)}: {size_text(size)} pixels, but the images of camera {camera} are "
-                f"{size_text(wanted)}; write the mask in that size"
+                f"{file}: {size_text(size)} pixels, but the images of camera {camera} are {size_text(wanted)}; {remedy}"
             )
 
     @property
