@@ -120,7 +120,7 @@ def import_colmap(
     fps: float,
     *,
     metres_per_unit: float = 1.0,
-    up: Literal["x", "y", "z"] = "z",
+    up: Literal["y", "z"] = "z",
     progress: Progress = silent,
 ) -> ImportReport:
     """Make a capture of a COLMAP project: a model and images/<camera>/<frame>.*, frames in the order of their names.
@@ -135,7 +135,7 @@ def import_colmap(
         Frames per second.
     metres_per_unit : float
         Length of the model's unit, metres.
-    up : "x", "y" or "z"
+    up : "y" or "z"
         Axis of the model that points up.
 
     Raises

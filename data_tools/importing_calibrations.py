@@ -40,7 +40,7 @@ def import_calibration(
     fps: float,
     *,
     metres_per_unit: float = 1.0,
-    up: Literal["x", "y", "z"] = "z",
+    up: Literal["y", "z"] = "z",
 ) -> tuple[Rig, tuple[str, ...]]:
     """Put the calibration of another tool into a capture folder, whose images or videos bear the cameras' names.
 
@@ -54,7 +54,7 @@ def import_calibration(
         Frames per second, for a new capture.toml.
     metres_per_unit : float
         Length of the calibration's unit, metres.
-    up : "x", "y" or "z"
+    up : "y" or "z"
         World axis that points up, for a new capture.toml.
 
     Returns

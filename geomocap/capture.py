@@ -10,6 +10,7 @@ bar/<camera>/000000.png          optional reference-bar recording
 
 from __future__ import annotations
 
+import os
 import threading
 import tomllib
 from collections import OrderedDict
@@ -19,18 +20,20 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 import av
-import cv2
 import numpy as np
 import tomli_w
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 
 from geomocap.cameras import Rig
 from geomocap.errors import CaptureError
-from geomocap.files import fingerprint, write_text
+from geomocap.files import fingerprint, links, write_text
+from geomocap.image_files import IMAGE_ENDINGS, ImageFolder, read_image, size_text
 from geomocap.settings import Settings
 
-IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
 VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+PARTS = ("capture.toml", "images", "videos", "background", "masks", "sparse", "bar", "reference")
+
+Point = tuple[float, float, float]
 
 
 class CaptureInfo(Settings):
@@ -39,12 +42,29 @@ class CaptureInfo(Settings):
     name: str = Field("capture", description="name of the recording")
     fps: float = Field(gt=0, description="frames per second")
     length_unit: Literal["m"] = Field("m", description="unit of the calibration")
-    up: Literal["x", "y", "z"] = Field("z", description="world axis that points up")
+    up: Literal["y", "z"] = Field("z", description="world axis that points up")
     cameras: tuple[str, ...] | None = Field(None, description="the cameras to use, in this order; all if not given")
     template_camera: str | None = Field(None, description="camera whose images are the templates of matching")
-    region_of_interest: tuple[tuple[float, float, float], tuple[float, float, float]] | None = Field(
+    region_of_interest: tuple[Point, Point] | None = Field(
         None, description="corners (min, max) of the working volume, metres, world"
     )
+
+    @field_validator("cameras")
+    @classmethod
+    def _each_once(cls, names: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        for k, name in enumerate(names or ()):
+            if names and name in names[:k]:
+                raise ValueError(f"camera {name} is there more than once; name each camera once")
+        return names
+
+    @field_validator("region_of_interest")
+    @classmethod
+    def _min_below_max(cls, box: tuple[Point, Point] | None) -> tuple[Point, Point] | None:
+        if box is not None and not all(low < high for low, high in zip(*box, strict=True)):
+            raise ValueError(
+                f"expected the corners (min, max), got {list(box[0])} and {list(box[1])}; each max must exceed its min"
+            )
+        return box
 
 
 class FrameSource(Protocol):
@@ -52,52 +72,14 @@ class FrameSource(Protocol):
 
     def __len__(self) -> int: ...
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the frames, pixels."""
+        ...
+
     def read(self, frame: int) -> np.ndarray:
         """Return frame `frame` as (H, W, 3) uint8, RGB."""
         ...
-
-
-def read_image(path: Path, *, gray: bool = False, alpha: bool = False) -> np.ndarray:
-    """Read an image file as (H, W, 3) uint8 RGB, as (H, W) uint8 if `gray`, as (H, W, 4) RGBA if `alpha`.
-
-    Raises
-    ------
-    CaptureError
-        If the file is missing, truncated or no image.
-    """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise CaptureError(f"{path}: can't be read ({error.strerror}); every camera needs every frame") from None
-    whole = not (
-        (data[:8] == b"\x89PNG\r\n\x1a\n" and b"IEND" not in data[-64:])
-        or (data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-4096:])
-    )
-    if whole and data:
-        mode = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_UNCHANGED if alpha else cv2.IMREAD_COLOR_RGB
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
-        if alpha and image is not None:
-            conversion = {2: cv2.COLOR_GRAY2RGBA, 4: cv2.COLOR_BGRA2RGBA}.get(
-                image.shape[2] if image.ndim == 3 else 2, cv2.COLOR_BGR2RGBA
-            )
-            image = cv2.cvtColor(image, conversion)
-        if image is not None:
-            return image
-    raise CaptureError(f"{path}: truncated or no image ({len(data)} bytes); write it again")
-
-
-@dataclass(frozen=True)
-class ImageFolder:
-    """Frames of one camera as numbered image files."""
-
-    files: tuple[Path, ...]
-
-    def __len__(self) -> int:
-        return len(self.files)
-
-    def read(self, frame: int) -> np.ndarray:
-        """Return frame `frame` as (H, W, 3) uint8, RGB."""
-        return read_image(self.files[frame])
 
 
 @dataclass
@@ -136,6 +118,12 @@ class Video:
 
     def __len__(self) -> int:
         return len(self._times)
+
+    @cached_property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the frames, pixels."""
+        height, width = self.read(0).shape[:2]
+        return width, height
 
     def read(self, frame: int) -> np.ndarray:
         """Return frame `frame` as (H, W, 3) uint8, RGB."""
@@ -202,11 +190,13 @@ class Capture:
         Raises
         ------
         CaptureError
-            If it isn't one: no capture.toml, a camera folder missing, frame counts that differ.
+            If it isn't one: no capture.toml or a wrong one, a camera folder missing, frame counts that differ, a link
+            that leads out.
         """
         path = Path(path)
         if not path.is_dir():
             raise CaptureError(f"{path}: no such capture folder")
+        check_links(path)
         info = read_capture_info(path)
         found = _find_sources(path)
         if not found:
@@ -217,6 +207,11 @@ class Capture:
                 raise CaptureError(
                     f"{path}: camera {name} of capture.toml has no folder images/{name} and no video videos/{name}.mp4"
                 )
+        if info.template_camera is not None and info.template_camera not in names:
+            raise CaptureError(
+                f"{path / 'capture.toml'}: template_camera: there is no camera {info.template_camera}; "
+                f"choose one of {', '.join(names)}"
+            )
         counts = {n: len(found[n]) for n in names}
         if len(set(counts.values())) > 1:
             listed = ", ".join(f"{n}: {c}" for n, c in counts.items())
@@ -244,11 +239,19 @@ class Capture:
         return self._background_file(camera) is not None
 
     def background(self, camera: str) -> np.ndarray:
-        """Read the empty background picture of a camera: (H, W, 4) uint8, RGBA, alpha 0 where it is not known."""
+        """Read the empty background picture of a camera: (H, W, 4) uint8, RGBA, alpha 0 where it is not known.
+
+        Raises
+        ------
+        CaptureError
+            If it is missing or has not the size of the images.
+        """
         file = self._background_file(camera)
         if file is None:
             raise CaptureError(f"{self.path}: no background/{camera}.png")
-        return read_image(file, alpha=True)
+        image = read_image(file, alpha=True)
+        self._check_size(file, camera, (image.shape[1], image.shape[0]), "take it with the settings of the recording")
+        return image
 
     def _background_file(self, camera: str) -> Path | None:
         files = [self.path / "background" / f"{camera}{e}" for e in IMAGE_ENDINGS]
@@ -259,11 +262,39 @@ class Capture:
         """Whether the capture brings its own silhouettes."""
         return (self.path / "masks").is_dir()
 
+    def mask_file(self, camera: str, frame: int) -> Path:
+        """Return where a given silhouette is, if the capture brings its own."""
+        return self.path / "masks" / camera / f"{frame:06d}.png"
+
     def mask(self, camera: str, frame: int) -> np.ndarray:
-        """Read a given silhouette: (H, W) uint8, 0 or 255."""
-        return np.where(read_image(self.path / "masks" / camera / f"{frame:06d}.png", gray=True) > 127, 255, 0).astype(
-            np.uint8
-        )
+        """Read a given silhouette: (H, W) uint8, 0 or 255.
+
+        Raises
+        ------
+        CaptureError
+            If it is missing, has not the size of the images, or other values than these two mark the subject.
+        """
+        file = self.mask_file(camera, frame)
+        values = read_image(file, gray=True)
+        self.check_mask_size(camera, frame, (values.shape[1], values.shape[0]))
+        mask = np.where(values > 127, 255, 0).astype(np.uint8)
+        if values.any() and not mask.any():
+            raise CaptureError(
+                f"{file}: its values go up to {values.max()} only; expected 0 for background and 255 for the subject: "
+                "write it with these"
+            )
+        return mask
+
+    def check_mask_size(self, camera: str, frame: int, size: tuple[int, int]) -> None:
+        """Raise CaptureError if a given silhouette has not the size of the camera's images."""
+        self._check_size(self.mask_file(camera, frame), camera, size, "write the mask in that size")
+
+    def _check_size(self, file: Path, camera: str, size: tuple[int, int], remedy: str) -> None:
+        wanted = self.sources[camera].size
+        if size != wanted:
+            raise CaptureError(
+                f"{file}: {size_text(size)} pixels, but the images of camera {camera} are {size_text(wanted)}; {remedy}"
+            )
 
     @property
     def is_calibrated(self) -> bool:
@@ -285,10 +316,11 @@ class Capture:
             raise CaptureError(f"{self.path}: not calibrated, no folder sparse/; run `geomocap calibrate {self.path}`")
         rig = Rig.read(self.path / "sparse", self.cameras)
         for name, (w, h) in zip(rig.names, rig.sizes, strict=True):
-            height, width = self.frame(name, 0).shape[:2]
-            if (width, height) != (w, h):
+            size = self.sources[name].size
+            if size != (w, h):
+                self.frame(name, self.n_frames - 1)  # a first frame unlike the others is no reason to calibrate again
                 raise CaptureError(
-                    f"{self.path}: images of camera {name} are {width}×{height}, but it is calibrated for {w}×{h}; "
+                    f"{self.path}: images of camera {name} are {size_text(size)}, but it is calibrated for {w}×{h}; "
                     "calibrate again, or import with the tool that made the calibration"
                 )
         return rig
@@ -296,6 +328,14 @@ class Capture:
     def fingerprint(self, *parts: str) -> str:
         """Digest of the names, sizes and times of the files of these parts ("images", "masks", "sparse" …)."""
         return fingerprint([self.path / "capture.toml", *(self.path / p for p in parts)])
+
+
+def check_links(path: Path) -> None:
+    """Raise CaptureError if a symbolic link leads out of a capture folder."""
+    root = os.path.realpath(path)
+    for link in (found for part in PARTS for found in links(path / part, depth=2)):
+        if not Path(os.path.realpath(link)).is_relative_to(root):
+            raise CaptureError(f"{link}: leads out of the capture folder; replace the link by what it stands for")
 
 
 def read_capture_info(path: Path) -> CaptureInfo:
@@ -312,7 +352,8 @@ def read_capture_info(path: Path) -> CaptureInfo:
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(p) for p in first["loc"])
-        raise CaptureError(f"{file}: {key}: {first['msg']}; see README, section Captures") from None
+        message = first["msg"].removeprefix("Value error, ")
+        raise CaptureError(f"{file}: {key}: {message}; see README, section Captures") from None
 
 
 def write_capture_info(path: Path, info: CaptureInfo) -> None:
@@ -322,7 +363,6 @@ def write_capture_info(path: Path, info: CaptureInfo) -> None:
 
 def _find_sources(path: Path) -> dict[str, FrameSource]:
     sources: dict[str, FrameSource] = {}
-    root = path.resolve()
     for folder in sorted(p for p in (path / "images").glob("*") if p.is_dir()):
         files = tuple(sorted(f for f in folder.iterdir() if f.suffix.lower() in IMAGE_ENDINGS))
         for k, file in enumerate(files):
@@ -334,8 +374,4 @@ def _find_sources(path: Path) -> dict[str, FrameSource]:
     for file in sorted((path / "videos").glob("*")):
         if file.suffix.lower() in VIDEO_ENDINGS and file.stem not in sources:
             sources[file.stem] = Video(file)
-    for name, source in sources.items():
-        first = source.files[0] if isinstance(source, ImageFolder) else source.path  # type: ignore[attr-defined]
-        if not first.resolve().is_relative_to(root):
-            raise CaptureError(f"{first}: leads out of the capture folder; copy the files of camera {name} into it")
     return sources

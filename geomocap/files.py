@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -52,3 +52,14 @@ def fingerprint(paths: Iterable[Path]) -> str:
                 stat = file.stat()
                 digest.update(f"{file.as_posix()}\0{stat.st_size}\0{stat.st_mtime_ns}\n".encode())
     return digest.hexdigest()
+
+
+def links(path: Path, depth: int) -> Iterator[Path]:
+    """Find the symbolic links at a path and in the folders below it, `depth` levels deep."""
+    if path.is_symlink():
+        yield path
+    if depth and path.is_dir():
+        with os.scandir(path) as entries:
+            for entry in entries:
+                if depth > 1 or entry.is_symlink():
+                    yield from links(Path(entry.path), depth - 1)

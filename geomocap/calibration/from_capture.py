@@ -17,7 +17,7 @@ from geomocap.calibration.settings import BarSettings
 from geomocap.calibration.targets import find_targets, gray_of
 from geomocap.calibration.world import World
 from geomocap.cameras import Rig
-from geomocap.capture import IMAGE_ENDINGS, read_capture_info, read_image
+from geomocap.capture import IMAGE_ENDINGS, check_links, read_capture_info, read_image
 from geomocap.errors import CalibrationError, CaptureError
 from geomocap.progress import Progress, silent
 from geomocap.settings import Settings
@@ -64,11 +64,12 @@ def calibrate_capture(
     Raises
     ------
     CaptureError
-        If the recording can't be read.
+        If the recording can't be read, or a link leads out of the folder.
     CalibrationError
         If no calibration can be had from it.
     """
     folder = Path(folder)
+    check_links(folder)
     settings = settings or BarSettings()
     cameras = read_capture_info(folder).cameras if (folder / "capture.toml").exists() else None
     recording = Recording.open(folder / "bar", cameras, length)

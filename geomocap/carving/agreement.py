@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
+
 import numpy as np
 
 from geomocap.carving.bounds import CELLS, focus, subject_cells
@@ -37,14 +40,38 @@ def check_cameras(views: PinholeViews) -> None:
     )
 
 
-def check_silhouettes(views: PinholeViews, frame: int, tolerance: int = 0) -> None:
-    """Raise GeometryError if more than `tolerance` cameras have an empty silhouette."""
+def check_silhouettes(
+    views: PinholeViews, frame: int, tolerance: int = 0, given: Mapping[str, Path] | None = None
+) -> None:
+    """Check that no more than `tolerance` cameras have an empty silhouette.
+
+    Parameters
+    ----------
+    views : PinholeViews
+    frame : int
+        For messages.
+    tolerance : int
+    given : mapping of camera name to Path, optional
+        The masks that the silhouettes were taken from, for messages.
+
+    Raises
+    ------
+    GeometryError
+        If more are empty.
+    """
     empty = [n for n, m in zip(views.names, views.masks, strict=True) if not m.any()]
-    if len(empty) > tolerance:
-        raise GeometryError(
-            f"frame {frame}: the silhouette of camera {', '.join(empty)} is empty; check its images and background, or "
-            "leave the camera or the frame out"
-        )
+    if len(empty) <= tolerance:
+        return
+    cause = "its image and background"
+    if given is not None:
+        cause = f"{', '.join(str(given[n]) for n in empty)} (expected: 255 where the subject is)"
+    remedy = "cut the recording to the frames that show it"
+    if len(views) - len(empty) >= 2:
+        remedy = f"set carving.hull.tolerance = {len(empty)}, name only the other cameras in capture.toml, or {remedy}"
+    raise GeometryError(
+        f"frame {frame}: the silhouette of camera {', '.join(empty)} is empty; check {cause}; where the subject is out "
+        f"of sight, {remedy}"
+    )
 
 
 def check_agreement(views: PinholeViews, frame: int, settings: HullSettings) -> None:

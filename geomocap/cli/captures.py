@@ -65,7 +65,7 @@ def import_(
     capture: CaptureFolder,
     fps: Annotated[float, typer.Option("--fps", min=0.001, help="Frames per second, where SOURCE doesn't say.")] = 30.0,
     up: Annotated[
-        Literal["x", "y", "z"], typer.Option("--up", help="World axis that points up, where SOURCE doesn't say.")
+        Literal["y", "z"], typer.Option("--up", help="World axis that points up, where SOURCE doesn't say.")
     ] = "z",
     metres_per_unit: Annotated[
         float, typer.Option("--metres-per-unit", min=1e-9, help="Metres in a unit of the calibration.")

@@ -30,8 +30,10 @@ class Description:
         self.facts.append((what, str(value)))
 
     def problem(self, what: object) -> None:
-        """Add something that is wrong, as one line."""
-        self.problems.append(" ".join(str(what).split()))
+        """Add something that is wrong, as one line, and once."""
+        line = " ".join(str(what).split())
+        if line not in self.problems:
+            self.problems.append(line)
 
 
 def count(n: int, one: str, many: str | None = None) -> str:

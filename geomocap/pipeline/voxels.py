@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomocap.capture import Capture, read_image
-from geomocap.carving.agreement import check_cameras
+from geomocap.carving.agreement import check_cameras, check_silhouettes
 from geomocap.carving.frames import carve_frame, needs_images
 from geomocap.carving.grid import Grid
 from geomocap.carving.settings import CarvingSettings
@@ -60,7 +60,7 @@ def _carve_all(job: Job, capture: Capture, settings: CarvingSettings) -> int:
 
 
 def _reported(job: Job, task: _Carve, frames: list[int]) -> Iterator[PinholeViews]:
-    yield from map_items(task.views, frames, job.executor, "volume", job.progress, 4)
+    yield from map_items(task.checked_views, frames, job.executor, "volume", job.progress, 4)
 
 
 @dataclass(frozen=True)
@@ -78,10 +78,17 @@ class _Carve:
         cameras = self.capture.cameras
         return self.undistortion.views([read_image(self.run.silhouette_file(c, frame), gray=True) for c in cameras])
 
+    def checked_views(self, frame: int) -> PinholeViews:
+        """Read the silhouettes of a frame; an empty one is reported with the mask it was taken from."""
+        capture, views = self.capture, self.views(frame)
+        given = {c: capture.mask_file(c, frame) for c in capture.cameras} if capture.has_masks else None
+        check_silhouettes(views, frame, self.settings.hull.tolerance, given)
+        return views
+
     def __call__(self, frame: int) -> None:
         assert self.grid is not None
         images = None
         if needs_images(self.settings):
             images = self.undistortion.images([self.capture.frame(c, frame) for c in self.capture.cameras])
-        found = carve_frame(self.views(frame), self.grid, self.settings, images, frame)
+        found = carve_frame(self.checked_views(frame), self.grid, self.settings, images, frame)
         found.write(self.run.frame_file("voxels", frame))

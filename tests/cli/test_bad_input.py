@@ -68,6 +68,7 @@ def test_empty_silhouettes(capture, small_capture, geomocap, tmp_path, frames):
         cv2.imwrite(str(folder / f"{k:06d}.png"), np.zeros((120, 160), np.uint8))
     said = refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
     assert f"frame {next(iter(frames))}: the silhouette of camera {folder.name} is empty" in said
+    assert f"check {folder / f'{next(iter(frames)):06d}.png'} (expected: 255" in said
 
 
 def test_missing_given_mask(capture, small_capture, geomocap, tmp_path):

@@ -209,6 +209,9 @@ def test_recordings_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "bar" / "bar.toml").unlink()
     with pytest.raises(CaptureError, match="metres between the target centres"):
         calibrate_capture(tmp_path)
+    (tmp_path / "sparse").symlink_to(tmp_path.parent)
+    with pytest.raises(CaptureError, match="sparse: leads out of the capture folder"):
+        calibrate_capture(tmp_path)
 
 
 def test_a_stronger_lens_model_only_where_it_is_needed() -> None:

@@ -9,6 +9,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from geomocap.capture import Capture, CaptureInfo, Video, write_capture_info
 from geomocap.errors import CaptureError
@@ -110,6 +111,52 @@ def test_image_size_against_calibration(tmp_path):
         _ = Capture.open(tmp_path).rig
 
 
+@pytest.mark.parametrize(("odd", "named"), [(3, 3), (0, 3)])
+def test_a_frame_of_another_size(tmp_path, odd, named):
+    make_capture(tmp_path)
+    cv2.imwrite(str(tmp_path / f"images/cam2/{odd:06d}.png"), np.zeros((60, 160, 3), np.uint8))
+    capture = Capture.open(tmp_path)
+    with pytest.raises(CaptureError, match=rf"cam2/{named:06d}\.png: \d+×\d+ pixels, but 000000\.png is"):
+        capture.frame("cam2", 3)
+    if odd == 0:
+        with pytest.raises(CaptureError, match="all frames of a camera need the same size"):
+            _ = capture.rig
+
+
+@pytest.mark.parametrize(
+    ("mask", "said"),
+    [
+        (np.full((60, 80), 255, np.uint8), "80×60 pixels, but the images of camera cam1 are 320×240"),
+        (np.eye(240, 320, dtype=np.uint8), "its values go up to 1 only; expected 0 for background and 255"),
+    ],
+)
+def test_a_given_mask_that_can_not_be_used(tmp_path, mask, said):
+    capture = Capture.open(make_capture(tmp_path))
+    file = tmp_path / "masks/cam1/000001.png"
+    file.parent.mkdir(parents=True)
+    cv2.imwrite(str(file), mask)
+    with pytest.raises(CaptureError, match=rf"masks/cam1/000001\.png: {said}"):
+        capture.mask("cam1", 1)
+
+
+def test_a_given_mask_may_be_empty(tmp_path):
+    capture = Capture.open(make_capture(tmp_path))
+    (tmp_path / "masks/cam1").mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / "masks/cam1/000001.png"), np.zeros((240, 320), np.uint8))
+    assert not capture.mask("cam1", 1).any()
+
+
+def test_a_turned_photograph_has_the_size_as_it_is_read(tmp_path):
+    make_capture(tmp_path, cameras=1, frames=1)
+    (tmp_path / "images/cam0/000000.png").unlink()
+    turn = Image.Exif()
+    turn[0x0112] = 6
+    Image.fromarray(picture(0, 0)).save(tmp_path / "images/cam0/000000.jpg", exif=turn)
+    capture = Capture.open(tmp_path)
+    assert capture.frame("cam0", 0).shape == (320, 240, 3)
+    assert capture.sources["cam0"].size == (240, 320)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -117,21 +164,57 @@ def test_image_size_against_calibration(tmp_path):
         ("name = 'x'", "fps: Field required"),
         ("fps = 30\nspeed = 3", "speed: Extra inputs"),
         ("fps = ", "not valid TOML"),
+        ("fps = 30\nup = 'x'", "up: Input should be 'y' or 'z'"),
+        ("fps = 30\ncameras = ['cam1', 'cam1']", "cameras: camera cam1 is there more than once"),
+        ("fps = 30\nregion_of_interest = [[0, 1, 0], [1, 0, 1]]", "region_of_interest: expected the corners"),
+        ("fps = 30\ntemplate_camera = 'nix'", "template_camera: there is no camera nix; choose one of cam0, cam1"),
+        ("fps = 30\ncameras = ['cam0']\ntemplate_camera = 'cam1'", "template_camera: there is no camera cam1"),
     ],
 )
 def test_wrong_capture_toml(tmp_path, text, said):
     make_capture(tmp_path)
     (tmp_path / "capture.toml").write_text(text)
-    with pytest.raises(CaptureError, match=said):
+    with pytest.raises(CaptureError, match=rf"capture\.toml: {said}"):
         Capture.open(tmp_path)
 
 
-def test_paths_can_not_lead_out_of_the_capture(tmp_path):
-    inside, outside = tmp_path / "capture", tmp_path / "outside"
-    make_capture(inside)
-    make_capture(outside)
-    (inside / "images/cam9").symlink_to(outside / "images/cam0")
-    with pytest.raises(CaptureError, match="leads out of the capture folder"):
+@pytest.mark.parametrize(
+    "part",
+    [
+        "images/cam9",
+        "images/cam1/000002.png",
+        "videos/cam9.mp4",
+        "background/cam1.png",
+        "masks",
+        "masks/cam1",
+        "masks/cam1/000000.png",
+        "sparse",
+        "sparse/cameras.txt",
+        "capture.toml",
+        "bar/cam1",
+    ],
+)
+def test_links_can_not_lead_out_of_the_capture(tmp_path, part):
+    inside, outside = make_capture(tmp_path / "capture"), tmp_path / "outside"
+    link = inside / part
+    outside.mkdir()
+    link.parent.mkdir(parents=True, exist_ok=True)
+    if link.exists():
+        link.rename(outside / link.name)
+    link.symlink_to(outside / link.name)
+    with pytest.raises(CaptureError, match=f"{part}: leads out of the capture folder"):
+        Capture.open(inside)
+
+
+def test_links_within_the_capture_are_followed(tmp_path):
+    inside = make_capture(tmp_path / "capture")
+    (inside / "images/cam1").rename(inside / "raw")
+    (inside / "images/cam1").symlink_to("../raw")
+    (tmp_path / "name").symlink_to(inside)
+    np.testing.assert_array_equal(Capture.open(tmp_path / "name").frame("cam1", 2), picture(1, 2))
+    (inside / "raw/000002.png").unlink()
+    (inside / "raw/000002.png").symlink_to(tmp_path / "elsewhere.png")
+    with pytest.raises(CaptureError, match=r"cam1/000002\.png: leads out of the capture folder"):
         Capture.open(inside)
 
 

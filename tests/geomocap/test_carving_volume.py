@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -151,6 +153,21 @@ def test_empty_silhouettes_are_named():
     check_silhouettes(views, 12, tolerance=1)
     with pytest.raises(GeometryError, match="frame 3: the silhouette of camera b is empty"):
         carve_frame(views, Grid.of_box(LOW, HIGH, resolution=32), frame=3)
+
+
+def test_an_empty_silhouette_comes_with_advice_that_can_be_followed():
+    views = figure(ring(4))
+    views.masks[1] = 0
+    with pytest.raises(GeometryError, match=r"check its image and background; .* set carving\.hull\.tolerance = 1"):
+        check_silhouettes(views, 3)
+    given = {n: Path(f"masks/{n}/000003.png") for n in views.names}
+    with pytest.raises(GeometryError, match=rf"check masks/{views.names[1]}/000003\.png \(expected: 255"):
+        check_silhouettes(views, 3, given=given)
+    allowed = CarvingSettings(hull=HullSettings(tolerance=1), resolution=32)
+    assert len(carve_frame(views, working_volume([views], allowed), allowed, frame=3).indices) > 100
+    views.masks[:3] = 0
+    with pytest.raises(GeometryError, match="out of sight, cut the recording to the frames that show it"):
+        check_silhouettes(views, 3)
 
 
 def test_views_from_one_side_only_bound_nothing():

@@ -64,6 +64,37 @@ def test_a_capture_with_problems(capture):
     assert "unequal numbers of frames" in describe(capture).problems[0]
 
 
+def test_a_capture_with_files_that_can_not_be_used(capture):
+    two_cameras().write(capture / "sparse")
+    flat = np.zeros((48, 64), np.uint8)
+    for name in "abc":
+        for part in (f"images/{name}/000003", f"background/{name}", *(f"masks/{name}/{k:06d}" for k in range(4))):
+            (capture / part).parent.mkdir(parents=True, exist_ok=True)
+            imwrite(str(capture / f"{part}.png"), flat)
+    assert describe(capture).problems == []
+    damaged = capture / "images/a/000001.png"
+    damaged.write_bytes(damaged.read_bytes()[:-20])
+    imwrite(str(capture / "images/b/000002.png"), flat[:20])
+    for k in range(4):
+        imwrite(str(capture / f"masks/a/{k:06d}.png"), flat[:, :20])
+    imwrite(str(capture / "masks/b/000000.png"), flat + 1)
+    imwrite(str(capture / "background/c.png"), flat[:10])
+    problems = [p.removeprefix(f"{capture}/") for p in describe(capture).problems]
+    said = [
+        "images/a/000001.png: truncated",
+        "images/b/000002.png: 64×20 pixels, but 000000.png is 64×48",
+        "background/c.png: 64×10 pixels, but the images of camera c are 64×48",
+        *(f"masks/a/{k:06d}.png: 20×48 pixels, but the images of camera a are 64×48" for k in range(3)),
+        "masks/a: 1 more file like these",
+        "masks/b/000000.png: its values go up to 1 only",
+    ]
+    assert len(problems) == len(said)
+    for problem, start in zip(problems, said, strict=True):
+        assert problem.startswith(start)
+    (capture / "capture.toml").write_text("fps = 15.0\ntemplate_camera = 'nix'\n")
+    assert "there is no camera nix" in describe(capture).problems[0]
+
+
 def test_a_calibration(tmp_path):
     two_cameras().write(tmp_path / "sparse")
     for path in (tmp_path, tmp_path / "sparse"):
