@@ -72,6 +72,8 @@ def test_feature_gradients_of_a_linear_field():
 def test_too_few_points_say_so():
     with pytest.raises(GeometryError, match="more than 9 are needed"):
         point_set(np.zeros((5, 3)), 100, 9)
+    with pytest.raises(GeometryError, match="frame 1: a surface of 5 points"):
+        track_nodes(lambda t: capsule(900)[: (900, 5)[t]], 2, SMALL)
 
 
 def test_samples_ride_rigidly():
