@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 from geomocap.errors import GeometryError
 from geomocap.files import fingerprint
 from geomocap.geometry import Voxels
+from geomocap.open3d_files import check_ply, read_by_open3d
 from geomocap.settings import Settings
 
 MESH_ENDINGS = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
@@ -139,14 +140,16 @@ def read_points(path: Path, settings: ScanSettings) -> np.ndarray:
     suffix = path.suffix.lower()
     if suffix in ARRAY_ENDINGS:
         return _read_array(path)
-    if suffix == ".ply" and _is_voxel_grid(path):
-        return Voxels.read(path).points
+    if suffix == ".ply":
+        check_ply(path)
+        if _is_voxel_grid(path):
+            return Voxels.read(path).points
     try:
         if suffix in MESH_ENDINGS:
             mesh = trimesh.load(path, process=False, force="mesh")
             if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
                 return _sample(mesh, settings)
-        cloud = o3d.io.read_point_cloud(path) if suffix in CLOUD_ENDINGS else None
+        cloud = read_by_open3d(o3d.io.read_point_cloud, path) if suffix in CLOUD_ENDINGS else None
     except Exception as error:
         raise GeometryError(f"{path}: can't be read as a scan ({str(error).splitlines()[0]})") from None
     if cloud is None or not cloud.has_points():

@@ -8,6 +8,7 @@ import numpy as np
 import open3d as o3d
 
 from geomocap.errors import GeometryError
+from geomocap.open3d_files import read_by_open3d
 from viz.drawing import sheet, write_png
 from viz.floor import floor
 from viz.palette import body_colors
@@ -39,18 +40,23 @@ def load(path: Path) -> Mesh:
     if ending not in {*MESHES, *CLOUDS}:
         raise GeometryError(f"{path}: can't be shown; expected {', '.join(sorted({*MESHES, *CLOUDS}))}")
     if ending == ".ply" and _is_voxel_grid(path):
-        grid = o3d.io.read_voxel_grid(path)
+        grid = read_by_open3d(o3d.io.read_voxel_grid, path)
         voxels = grid.get_voxels()
+        if not voxels:
+            raise GeometryError(f"{path}: holds no voxels; make it again")
         indices = np.array([v.grid_index for v in voxels]).reshape(-1, 3)
         colors = np.array([v.color for v in voxels]).reshape(-1, 3) * 255
         return cubes(indices, np.asarray(grid.origin), grid.voxel_size, colors)
     if ending in MESHES:
-        found = o3d.io.read_triangle_mesh(path)
+        found = read_by_open3d(o3d.io.read_triangle_mesh, path)
         if found.has_triangles():
             return _triangles(found)
     if ending not in CLOUDS:
         raise GeometryError(f"{path}: holds no triangles; is it truncated?")
-    points = read_points(path)
+    try:
+        points = read_points(path)
+    except GeometryError:
+        raise GeometryError(f"{path}: holds neither triangles nor points; is it whole?") from None
     colors = points.colors if points.bodies is None else body_colors(points.bodies)
     return gems(points.positions, colors, 0.75 * spacing(points.positions), points.normals)
 
