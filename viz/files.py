@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 
-from geomocap.errors import GeometryError
+from geomocap.errors import GeometryError, RunError
 from geomocap.open3d_files import read_by_open3d
 from viz.drawing import sheet, write_png
 from viz.floor import floor
@@ -21,6 +21,7 @@ from viz.volumes import cubes, gems, spacing
 
 MESHES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 CLOUDS = (".ply", ".pcd", ".xyz", ".pts")
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
 
 def load(path: Path) -> Mesh:
@@ -82,29 +83,31 @@ def render_file(path: Path, picture: Path | None = None, up: str = "z") -> Path:
     path : Path
         PLY (voxel grid, points or mesh), PCD, XYZ, PTS, OBJ, STL, OFF or GLB.
     picture : Path, optional
-        Where to write the PNG; beside the file, with the ending .png, if not given.
+        Where to write it, as PNG or whatever its ending says; beside the file, with the ending .png, if not given.
     up : {"x", "y", "z"}
         World axis that points up.
 
     Returns
     -------
     Path
-        The PNG.
+        The picture.
 
     Raises
     ------
     GeometryError
         If the file holds nothing that can be shown.
     RunError
-        If the picture can't be written.
+        If the picture can't be written, or its name isn't that of a picture.
     """
     path = Path(path)
+    target = path.with_suffix(".png") if picture is None else Path(picture)
+    if target.suffix.lower() not in PICTURES:
+        raise RunError(f"{target}: no name of a picture; expected one of the endings {', '.join(PICTURES)}")
     mesh = load(path)
     stage = stage_of([mesh.vertices], [0], 1, up_vector(up))
     tiles: list[np.ndarray | None] = []
     for angles in VIEWS.values():
         view = stage.view(*angles, tile_size(stage, *angles, 160_000))
         tiles.append(render([mesh], view, None, stage.up).over(floor(stage, view, [mesh])))
-    target = picture or path.with_suffix(".png")
     write_png(target, sheet([tiles], (), tuple(VIEWS)))
     return target

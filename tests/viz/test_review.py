@@ -285,6 +285,13 @@ def test_bad_ply_is_told_in_one_line(tmp_path: Path, capfd, content: bytes, said
     assert "".join(capfd.readouterr()) == ""
 
 
+@pytest.mark.parametrize("name", ["p8.txt", "p8", "scan.obj"])
+def test_picture_of_no_picture_name_is_refused_before_any_work(tmp_path: Path, name: str) -> None:
+    (tmp_path / "scan.obj").touch()
+    with pytest.raises(RunError, match=rf"{name}: no name of a picture; expected .*\.png"):
+        render_file(tmp_path / "scan.obj", tmp_path / name)
+
+
 def test_clouds_are_drawn_without_a_word(tmp_path: Path, capfd) -> None:
     points = np.random.default_rng(0).normal(size=(50, 3))
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
