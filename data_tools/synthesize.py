@@ -62,7 +62,7 @@ class SynthesisSettings(Settings):
         None, gt=0, description="distance of the bar's targets (m); a third of the volume's largest extent if not given"
     )
     withhold_calibration: bool = Field(False, description="write no sparse/ into the capture (the truth has it)")
-    video: bool = Field(False, description="write videos/<camera>.mp4 (H.264, lossy) instead of PNG images")
+    video: bool = Field(False, description="write `videos/<camera>.mp4` (H.264, lossy) instead of PNG images")
     seed: int = Field(0, ge=0, description="seed of everything random")
 
 

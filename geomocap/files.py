@@ -19,7 +19,8 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     Raises
     ------
     RunError
-        If the disk is full, read-only or the folder can't be made; nothing is left behind then.
+        If the disk is full, read-only or the folder can't be made, such as where a file is in the way; nothing is left
+        behind then.
     """
     temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
     try:
@@ -30,6 +31,11 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     except OSError as error:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+        in_the_way = next((p for p in path.parents if p.is_file()), None)
+        if in_the_way is not None:
+            raise RunError(
+                f"{path}: can't be written ({in_the_way} is a file, a folder is expected); choose another folder"
+            ) from None
         raise RunError(
             f"{path}: can't be written ({error.strerror or error}); free space or choose another folder"
         ) from None

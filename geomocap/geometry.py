@@ -12,6 +12,7 @@ import open3d as o3d
 
 from geomocap.errors import GeometryError
 from geomocap.files import write_atomic
+from geomocap.open3d_files import read_by_open3d
 from geomocap.palette import body_colors
 
 
@@ -102,9 +103,9 @@ class Voxels:
         voxels = _read_binary(path)
         if voxels is not None:
             return cls._sorted(*voxels)
-        grid = o3d.io.read_voxel_grid(path)
+        grid = read_by_open3d(o3d.io.read_voxel_grid, path)
         if not grid.has_voxels():
-            raise GeometryError(f"{path}: no readable voxel grid; delete it and run again")
+            raise GeometryError(f"{path}: no readable voxel grid; make it again")
         return cls.from_open3d(grid)
 
 
@@ -146,7 +147,7 @@ class BodyPoints:
         """
         if not path.is_file():
             raise GeometryError(f"{path}: no such point cloud")
-        cloud = o3d.t.io.read_point_cloud(path)
+        cloud = read_by_open3d(o3d.t.io.read_point_cloud, path)
         if "body" not in cloud.point:
             raise GeometryError(f"{path}: has no attribute `body`; delete it and run again")
         return cls(cloud.point.positions.numpy().astype(np.float64), cloud.point["body"].numpy().ravel())
@@ -162,7 +163,7 @@ def read_cloud(path: Path) -> np.ndarray:
     """
     if not path.is_file():
         raise GeometryError(f"{path}: no such point cloud")
-    cloud = o3d.t.io.read_point_cloud(path)
+    cloud = read_by_open3d(o3d.t.io.read_point_cloud, path)
     if "positions" not in cloud.point or not len(cloud.point.positions):
         raise GeometryError(f"{path}: holds no points; delete it and run again")
     return cloud.point.positions.numpy().astype(np.float64)
@@ -178,7 +179,7 @@ def read_cloud_colors(path: Path) -> np.ndarray:
     """
     if not path.is_file():
         raise GeometryError(f"{path}: no such point cloud")
-    cloud = o3d.t.io.read_point_cloud(path)
+    cloud = read_by_open3d(o3d.t.io.read_point_cloud, path)
     if "colors" not in cloud.point:
         raise GeometryError(f"{path}: its points have no colours; delete it and run again")
     return cloud.point.colors.numpy()

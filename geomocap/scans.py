@@ -1,7 +1,7 @@
 """Anybody's geometry as a sequence of point sets: meshes, point clouds, voxel grids, arrays.
 
-A folder is a sequence in the order of its file names (numbers by value), one file is one scan, and an NPZ file may hold
-a whole sequence.
+A folder is a sequence of files of one format in the order of their numbers, without gaps; one file is one scan, and an
+NPZ file may hold a whole sequence. A point with a coordinate that is NaN is a missing one in every format and left out.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -22,6 +23,7 @@ from scipy.spatial import cKDTree
 from geomocap.errors import GeometryError
 from geomocap.files import fingerprint
 from geomocap.geometry import Voxels
+from geomocap.open3d_files import check_ply, read_by_open3d
 from geomocap.settings import Settings
 
 MESH_ENDINGS = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
@@ -67,19 +69,25 @@ class Scans:
         return len(self.names)
 
     def points(self, frame: int) -> np.ndarray:
-        """Return the points of one frame, (N, 3) float, metres.
+        """Return the points of one frame, (N, 3) float, metres, without those that are NaN.
 
         Raises
         ------
         GeometryError
-            If the scan can't be read, is empty, or holds coordinates that are not finite.
+            If the scan can't be read, holds no points, infinite coordinates, or only points that coincide.
         """
+        name = self.names[frame]
         points = np.ascontiguousarray(self.read(frame), dtype=np.float64) * self.settings.scale
         if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
-            raise GeometryError(f"{self.names[frame]}: expected points of shape (N, 3), got {points.shape}")
-        if not np.isfinite(points).all():
-            bad = int((~np.isfinite(points)).any(axis=1).sum())
-            raise GeometryError(f"{self.names[frame]}: {bad} points are not finite; remove them")
+            raise GeometryError(f"{name}: expected points of shape (N, 3), got {points.shape}")
+        missing = np.isnan(points).any(axis=1)
+        if missing.all():
+            raise GeometryError(f"{name}: all {len(points)} points are missing (NaN); a frame needs some")
+        points = points[~missing]
+        if infinite := int(np.isinf(points).any(axis=1).sum()):
+            raise GeometryError(f"{name}: {infinite} points are infinite; remove them, or set them to NaN")
+        if len(points) > 1 and (points == points[0]).all():
+            raise GeometryError(f"{name}: all {len(points)} points coincide; is the file right?")
         return points
 
     @cached_property
@@ -106,27 +114,26 @@ def point_spacing(points: np.ndarray) -> float:
 
 
 def open_scans(source: Path, settings: ScanSettings) -> Scans:
-    """Open a file or a folder of scans; nothing but names is read yet.
+    """Open a file or a folder of scans; of a folder nothing but names is read yet.
 
     Raises
     ------
     GeometryError
-        If there is nothing that can be read.
+        If there is nothing that can be read, or a folder's files are no single sequence without gaps.
     """
     source = Path(source)
     if source.is_dir():
-        known = (*MESH_ENDINGS, *CLOUD_ENDINGS, *ARRAY_ENDINGS)
-        files = sorted((p for p in source.iterdir() if p.suffix.lower() in known), key=_by_number)
-        if not files:
-            raise GeometryError(f"{source}: holds no scans ({', '.join(sorted({e[1:] for e in known}))})")
+        files = _sequence(source)
         return Scans(source, tuple(str(f) for f in files), lambda k: read_points(files[k], settings), settings)
     if not source.is_file():
         raise GeometryError(f"{source}: no such file or folder of scans")
     if source.suffix.lower() in ARRAY_ENDINGS:
         array = _read_array(source)
         frames = array if array.ndim == 3 else array[None]
+        if not len(frames):
+            raise GeometryError(f"{source}: holds no frames; expected points of shape (T, N, 3), got {array.shape}")
         names = tuple(f"{source}, frame {k}" for k in range(len(frames)))
-        return Scans(source, names, lambda k: frames[k][np.isfinite(frames[k]).all(axis=1)], settings)
+        return Scans(source, names, lambda k: frames[k], settings)
     return Scans(source, (str(source),), lambda _: read_points(source, settings), settings)
 
 
@@ -135,14 +142,16 @@ def read_points(path: Path, settings: ScanSettings) -> np.ndarray:
     suffix = path.suffix.lower()
     if suffix in ARRAY_ENDINGS:
         return _read_array(path)
-    if suffix == ".ply" and _is_voxel_grid(path):
-        return Voxels.read(path).points
+    if suffix == ".ply":
+        check_ply(path)
+        if _is_voxel_grid(path):
+            return Voxels.read(path).points
     try:
         if suffix in MESH_ENDINGS:
             mesh = trimesh.load(path, process=False, force="mesh")
             if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
                 return _sample(mesh, settings)
-        cloud = o3d.io.read_point_cloud(path) if suffix in CLOUD_ENDINGS else None
+        cloud = read_by_open3d(o3d.io.read_point_cloud, path) if suffix in CLOUD_ENDINGS else None
     except Exception as error:
         raise GeometryError(f"{path}: can't be read as a scan ({str(error).splitlines()[0]})") from None
     if cloud is None or not cloud.has_points():
@@ -154,6 +163,9 @@ def _sample(mesh: trimesh.Trimesh, settings: ScanSettings) -> np.ndarray:
     """Sample a surface evenly by area: stratified over the triangles in their order, seeded."""
     rng = np.random.default_rng(settings.seed)
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+    if np.isinf(vertices).any():
+        raise GeometryError("it has infinite vertices; remove them")
+    faces = faces[~np.isnan(vertices[faces]).any(axis=(1, 2))]
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     if not area.sum() > 0:
@@ -195,7 +207,44 @@ def _is_voxel_grid(path: Path) -> bool:
     return b"element origin" in header or b"voxel_size" in header
 
 
+def _sequence(folder: Path) -> list[Path]:
+    """List a folder's scans in the order of their numbers; refuse what is not one sequence."""
+    known = {*MESH_ENDINGS, *CLOUD_ENDINGS, *ARRAY_ENDINGS}
+    files = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in known and not p.name.startswith(".")]
+    if not files:
+        raise GeometryError(f"{folder}: holds no scans ({', '.join(sorted(e[1:] for e in known))})")
+    formats = sorted({p.suffix.lower()[1:] for p in files})
+    if len(formats) > 1:
+        raise GeometryError(f"{folder}: holds scans of several formats ({', '.join(formats)}); keep one of them")
+    files.sort(key=_by_number)
+    patterns = {tuple(re.split(r"\d+", p.stem.lower())): p.name for p in reversed(files)}
+    if len(patterns) > 1 and any(len(texts) > 1 for texts in patterns):
+        first, second, *_ = sorted(patterns.values())
+        raise GeometryError(f"{folder}: {first} and {second} are of different sequences; keep one sequence in a folder")
+    _check_gaps(folder, files)
+    return files
+
+
+def _check_gaps(folder: Path, files: list[Path]) -> None:
+    """Refuse numbers that are missing or there twice: frames are evenly spaced in time."""
+    numbers = [tuple(int(n) for n in re.findall(r"\d+", p.stem)) for p in files]
+    for k, (a, b) in enumerate(pairwise(numbers)):
+        if a and a == b:
+            raise GeometryError(f"{folder}: {files[k].name} and {files[k + 1].name} have the same number; remove one")
+    varying = [column for column in zip(*numbers, strict=True) if len(set(column)) > 1]
+    if len(varying) != 1:  # no numbers, a single file, or dates with times, which may jump
+        return
+    number = varying[0]
+    step = min(b - a for a, b in pairwise(number))
+    for k, (a, b) in enumerate(pairwise(number)):
+        if b - a >= 2 * step:
+            raise GeometryError(
+                f"{folder}: number {a + step} is missing between {files[k].name} and {files[k + 1].name}; "
+                "add it, or number the files without gaps"
+            )
+
+
 def _by_number(path: Path) -> list[tuple[int, int, str]]:
     """Sort key under which frame10 comes after frame9."""
-    parts = re.split(r"(\d+)", path.name)
-    return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts]
+    parts = re.split(r"(\d+)", path.name.lower())
+    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
+from pydantic_core import PydanticCustomError
 
 from geomocap.errors import SettingsError
 
@@ -18,6 +19,27 @@ class Settings(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _truth_is_no_number(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse true and false for numbers, also within lists; Python would take them as 1 and 0."""
+        types = _types(cls.model_fields[str(info.field_name)].annotation)
+        if types & {int, float} and bool not in types and _holds_truth(value):
+            raise PydanticCustomError("truth_for_number", "Input should be a number, not true or false")
+        return value
+
+
+def _types(annotation: Any) -> set[Any]:
+    """Return a type, or those that a union or a tuple is made of."""
+    parts = get_args(annotation)
+    return set[Any]().union(*map(_types, parts)) if parts else {annotation}
+
+
+def _holds_truth(value: Any) -> bool:
+    if isinstance(value, list | tuple):
+        return any(map(_holds_truth, value))
+    return isinstance(value, bool)
 
 
 def check_settings(model: type[Model], values: dict[str, Any], where: str = "") -> Model:

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 
-from geomocap.errors import GeometryError
+from geomocap.errors import GeometryError, RunError
+from geomocap.open3d_files import read_by_open3d
 from viz.drawing import sheet, write_png
 from viz.floor import floor
 from viz.palette import body_colors
@@ -20,6 +21,7 @@ from viz.volumes import cubes, gems, spacing
 
 MESHES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 CLOUDS = (".ply", ".pcd", ".xyz", ".pts")
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
 
 def load(path: Path) -> Mesh:
@@ -39,18 +41,23 @@ def load(path: Path) -> Mesh:
     if ending not in {*MESHES, *CLOUDS}:
         raise GeometryError(f"{path}: can't be shown; expected {', '.join(sorted({*MESHES, *CLOUDS}))}")
     if ending == ".ply" and _is_voxel_grid(path):
-        grid = o3d.io.read_voxel_grid(path)
+        grid = read_by_open3d(o3d.io.read_voxel_grid, path)
         voxels = grid.get_voxels()
+        if not voxels:
+            raise GeometryError(f"{path}: holds no voxels; make it again")
         indices = np.array([v.grid_index for v in voxels]).reshape(-1, 3)
         colors = np.array([v.color for v in voxels]).reshape(-1, 3) * 255
         return cubes(indices, np.asarray(grid.origin), grid.voxel_size, colors)
     if ending in MESHES:
-        found = o3d.io.read_triangle_mesh(path)
+        found = read_by_open3d(o3d.io.read_triangle_mesh, path)
         if found.has_triangles():
             return _triangles(found)
     if ending not in CLOUDS:
         raise GeometryError(f"{path}: holds no triangles; is it truncated?")
-    points = read_points(path)
+    try:
+        points = read_points(path)
+    except GeometryError:
+        raise GeometryError(f"{path}: holds neither triangles nor points; is it whole?") from None
     colors = points.colors if points.bodies is None else body_colors(points.bodies)
     return gems(points.positions, colors, 0.75 * spacing(points.positions), points.normals)
 
@@ -76,29 +83,31 @@ def render_file(path: Path, picture: Path | None = None, up: str = "z") -> Path:
     path : Path
         PLY (voxel grid, points or mesh), PCD, XYZ, PTS, OBJ, STL, OFF or GLB.
     picture : Path, optional
-        Where to write the PNG; beside the file, with the ending .png, if not given.
+        Where to write it, as PNG or whatever its ending says; beside the file, with the ending .png, if not given.
     up : {"x", "y", "z"}
         World axis that points up.
 
     Returns
     -------
     Path
-        The PNG.
+        The picture.
 
     Raises
     ------
     GeometryError
         If the file holds nothing that can be shown.
     RunError
-        If the picture can't be written.
+        If the picture can't be written, or its name isn't that of a picture.
     """
     path = Path(path)
+    target = path.with_suffix(".png") if picture is None else Path(picture)
+    if target.suffix.lower() not in PICTURES:
+        raise RunError(f"{target}: no name of a picture; expected one of the endings {', '.join(PICTURES)}")
     mesh = load(path)
     stage = stage_of([mesh.vertices], [0], 1, up_vector(up))
     tiles: list[np.ndarray | None] = []
     for angles in VIEWS.values():
         view = stage.view(*angles, tile_size(stage, *angles, 160_000))
         tiles.append(render([mesh], view, None, stage.up).over(floor(stage, view, [mesh])))
-    target = picture or path.with_suffix(".png")
     write_png(target, sheet([tiles], (), tuple(VIEWS)))
     return target

@@ -14,6 +14,7 @@ import open3d as o3d
 from geomocap.capture import Capture, read_image
 from geomocap.errors import GeometryError, RunError
 from geomocap.geometry import Voxels
+from geomocap.open3d_files import read_by_open3d
 from geomocap.run import Run
 
 KINDS = ("bodies", "voxels", "cloud")
@@ -46,7 +47,7 @@ def read_points(path: Path) -> Points:
     GeometryError
         If the file holds no points.
     """
-    cloud = o3d.t.io.read_point_cloud(path)
+    cloud = read_by_open3d(o3d.t.io.read_point_cloud, path)
     if cloud.is_empty():
         raise GeometryError(f"{path}: no readable point cloud; delete it and run again")
     positions = cloud.point.positions.numpy().astype(np.float64)

@@ -15,7 +15,7 @@ from geomocap.cli.evaluate import evaluate
 from geomocap.cli.execution import Scheduler, Workers
 from geomocap.cli.export import export
 from geomocap.cli.info import info
-from geomocap.cli.jobs import CaptureFolder, RunFolder, capture_job, scans_job
+from geomocap.cli.jobs import CaptureFolder, ExistingRun, RunFolder, capture_job, scans_job
 from geomocap.cli.keypoints import keypoints
 from geomocap.cli.progress import progress_bars
 from geomocap.cli.reports import capture_of, console, review_job, tell_clouds, tell_results
@@ -156,7 +156,7 @@ def run(
 
 
 @app.command()
-def review(run: RunFolder, workers: Workers = None) -> None:
+def review(run: ExistingRun, workers: Workers = None) -> None:
     """Make the pictures and the report of a run anew, from its files."""
     with progress_bars() as progress:
         review_files(Run(run), capture_of(Run(run)), progress=progress)

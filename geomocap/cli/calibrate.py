@@ -74,8 +74,8 @@ def calibrate(
     """Calibrate the cameras of a capture with a reference bar; writes CAPTURE/sparse and a report.
 
     A bar with two bright balls a known distance apart is moved through the whole volume, turned in all directions, and
-    recorded by all cameras: CAPTURE/bar/<camera>/000000.png or CAPTURE/bar/<camera>.mp4, and CAPTURE/bar/bar.toml with
-    `length = 0.5` (m). Nothing else need be known.
+    recorded by all cameras: `CAPTURE/bar/<camera>/000000.png` or `CAPTURE/bar/<camera>.mp4`, and CAPTURE/bar/bar.toml
+    with `length = 0.5` (m). Nothing else need be known.
 
     Example: `geomocap calibrate studio --distance 0.5 --floor 0-5`
     """

@@ -21,6 +21,7 @@ from geomocap.scans import open_scans
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder, with capture.toml.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder; made if it isn't there.")]
+ExistingRun = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of `geomocap run`, `track` or `segment`.")]
 
 
 @contextmanager

@@ -10,6 +10,7 @@ import numpy as np
 import typer
 
 from geomocap.cli.export import report_exported
+from geomocap.cli.jobs import ExistingRun
 from geomocap.cli.reports import capture_of, console
 from geomocap.errors import GeomocapError
 from geomocap.export.run_export import export_run
@@ -21,7 +22,7 @@ from geomocap.tracking.keypoints import Measured
 
 
 def keypoints(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of `geomocap run`, `track` or `segment`.")],
+    run: ExistingRun,
     points: Annotated[
         Path | None,
         typer.Option("--points", metavar="FILE.toml", help="Key-points; RUN/keypoints.toml if not given."),

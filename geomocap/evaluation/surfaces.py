@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from geomocap.evaluation.result import Curve, Evaluation, EvaluationError
 from geomocap.evaluation.truth import Truth
 from geomocap.geometry import Voxels
+from geomocap.open3d_files import read_by_open3d
 from geomocap.run import Run
 
 NEAR_MM = 10.0
@@ -67,7 +68,7 @@ def read_geometry(run: Run, kind: Literal["voxels", "cloud"], frame: int) -> np.
 def read_labelled(run: Run, kind: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a frame's points, (N, 3) metres, and their bodies, (N,) int, -1 where there are none."""
     file = run.frame_file(kind, frame)
-    cloud = o3d.t.io.read_point_cloud(file)
+    cloud = read_by_open3d(o3d.t.io.read_point_cloud, file)
     if "positions" not in cloud.point:
         raise EvaluationError(f"{file}: no readable points; delete it and run again")
     points = cloud.point.positions.numpy().astype(float)

@@ -16,6 +16,7 @@ from geomocap.export.settings import ExportSettings
 from geomocap.export.skinned_mesh import INFLUENCES, SkinnedMesh
 from geomocap.export.surface import Surface, surface_through
 from geomocap.geometry import Voxels
+from geomocap.open3d_files import read_by_open3d
 from geomocap.run import Run
 
 VOTERS = 15  # points that say which body a vertex belongs to
@@ -136,7 +137,7 @@ def node_of_body(motion: Motion, bodies: np.ndarray) -> np.ndarray:
 
 
 def _read_bodies(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-    cloud = o3d.t.io.read_point_cloud(file)
+    cloud = read_by_open3d(o3d.t.io.read_point_cloud, file)
     if "positions" not in cloud.point or "body" not in cloud.point:
         raise MotionError(f"{file}: no points with the attribute body; delete it and run again")
     points = cloud.point.positions.numpy().astype(float)
@@ -156,7 +157,7 @@ def _true_colors(run: Run, frame: int, points: np.ndarray) -> np.ndarray:
         voxels = Voxels.read(file)
         places, colors = voxels.points, voxels.colors
     else:
-        cloud = o3d.t.io.read_point_cloud(file) if file.is_file() else o3d.t.geometry.PointCloud()
+        cloud = read_by_open3d(o3d.t.io.read_point_cloud, file) if file.is_file() else o3d.t.geometry.PointCloud()
         if "positions" not in cloud.point or "colors" not in cloud.point:
             raise MotionError(f'{file}: no colours there; keep skin_colors = "body"')
         places, colors = cloud.point.positions.numpy(), _bytes(cloud.point.colors.numpy())

@@ -224,7 +224,10 @@ def track_nodes(
         found = unit.to(np.asarray(points(frame), float))
         # dense points are averaged over as much of the surface as few points are
         neighbours = max(settings.neighbours, min(len(found), 3 * settings.points) * 5 // (2 * settings.nodes))
-        return point_set(found, settings.points, neighbours, settings.seed + frame, more)
+        try:
+            return point_set(found, settings.points, neighbours, settings.seed + frame, more)
+        except GeometryError as error:
+            raise GeometryError(f"frame {frame}: {error}; check this frame's geometry") from None
 
     frames = list(map_items(prepare, list(range(n_frames)), executor, "points", progress))
     candidates = list(range(0, n_frames, max(1, n_frames // 30)))

@@ -80,7 +80,7 @@ class PointSet:
 def point_set(
     points: np.ndarray, n_points: int, neighbours: int, seed: int = 0, features: np.ndarray | None = None
 ) -> PointSet:
-    """Make a point set of at most `n_points`, normals and gradients measured on all points.
+    """Make a point set of at most `n_points`, normals and gradients measured on all points; coincident ones are one.
 
     Parameters
     ----------
@@ -95,16 +95,20 @@ def point_set(
     Raises
     ------
     GeometryError
-        If there are fewer points than a normal needs.
+        If there are fewer distinct points than a normal needs.
     """
     points = np.ascontiguousarray(points, float)
-    if len(points) <= neighbours:
-        raise GeometryError(f"a surface of {len(points)} points has no normals; more than {neighbours} are needed")
     if features is None:
         features = np.zeros((len(points), 0))
+    chosen = np.arange(len(points))
     if len(points) > 3 * n_points:
         chosen = np.sort(np.random.default_rng(seed).permutation(len(points))[: 3 * n_points])
-        points, features = points[chosen], features[chosen]
+    chosen = chosen[np.sort(np.unique(points[chosen], axis=0, return_index=True)[1])]
+    if len(chosen) <= neighbours:
+        raise GeometryError(
+            f"a surface of {len(chosen)} distinct points has no normals; more than {neighbours} are needed"
+        )
+    points, features = points[chosen], features[chosen]
     near = cKDTree(points).query(points, neighbours + 1)[1]
     normals = oriented_normals(points, near)
     gradients = feature_gradients(points, normals, near, features)

@@ -27,6 +27,11 @@ def test_run_toml_is_a_settings_file(tmp_path):
     [
         ("[carving]\nresolutoin = 3", r"a\.toml: unknown setting carving\.resolutoin"),
         ("[carving]\nresolution = 'big'", r"setting carving\.resolution = 'big': Input should be a valid integer"),
+        ("[carving]\nresolution = true", r"carving\.resolution = True: Input should be a number, not true or false"),
+        ("[scans]\nscale = true", r"scans\.scale = True: Input should be a number"),
+        ("[scans]\nspacing = false", r"scans\.spacing = False: Input should be a number"),
+        ("[carving]\nvolume = [[0, 0, 0], [1, true, 1]]", r"carving\.volume = .*: Input should be a number"),
+        ("[nodes]\ncolors = 'blue'", r"nodes\.colors = 'blue'"),
         ("[carving.hull]\noutside = 'here'", r"carving\.hull\.outside = 'here'"),
         ("[carving]\nmargin = inf", r"carving\.margin = inf"),
         ("carving = ", "not valid TOML"),

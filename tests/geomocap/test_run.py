@@ -112,3 +112,11 @@ def test_voxels_survive_open3d_s_file(tmp_path):
     np.testing.assert_array_equal(back.colors, slow.colors)
     o3d.io.write_voxel_grid(str(tmp_path / "ascii.ply"), voxels.to_open3d(), write_ascii=True)
     np.testing.assert_array_equal(Voxels.read(tmp_path / "ascii.ply").indices, voxels.indices)
+
+
+@pytest.mark.parametrize("inside", ["", "further/in"])
+def test_a_file_in_place_of_the_folder_is_named(tmp_path, inside):
+    file = tmp_path / "afile"
+    file.touch()
+    with pytest.raises(RunError, match=rf"can't be written \({file} is a file, a folder is expected\)"):
+        Run(file / inside).write_record({})

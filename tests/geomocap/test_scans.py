@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import open3d as o3d
 import pytest
@@ -47,13 +50,77 @@ def test_voxel_grid_gives_its_centres(tmp_path):
 
 
 def test_sequences_are_ordered_by_number(tmp_path):
-    for k in (10, 9, 1):
-        np.savez(tmp_path / f"scan{k}.npz", points=np.full((4, 3), float(k)))
+    for k in (10, 9, 11):
+        np.savez(tmp_path / f"scan{k}.npz", points=np.arange(12.0).reshape(4, 3) + k)
     scans = open_scans(tmp_path, ScanSettings())
-    assert [scans.points(k)[0, 0] for k in range(3)] == [1, 9, 10]
+    assert [scans.points(k)[0, 0] for k in range(3)] == [9, 10, 11]
     np.savez(tmp_path / "all.npz", points=np.arange(24.0).reshape(2, 4, 3))
     both = open_scans(tmp_path / "all.npz", ScanSettings())
     assert len(both) == 2 and both.points(1)[0, 0] == 12
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["s_1.obj", "s_1.ply", "s_2.obj", "s_2.ply"], "several formats (obj, ply)"),
+        (["000002.ply", "000004.ply"], None),  # every second frame
+        (["0.ply", "1.ply", "2.ply", "4.ply", "5.ply"], "number 3 is missing between 2.ply and 4.ply"),
+        (["v2_00.ply", "v2_05.ply", "v2_20.ply"], "number 10 is missing between v2_05.ply and v2_20.ply"),
+        (["s_1.ply", "s_01.ply", "s_2.ply"], "s_01.ply and s_1.ply have the same number"),
+        (["left_0.ply", "left_1.ply", "right_0.ply"], "left_0.ply and right_0.ply are of different sequences"),
+        (["mean.ply", "s_0.ply", "s_1.ply"], "mean.ply and s_0.ply are of different sequences"),
+        (["a.ply", "b.PLY", "d.ply"], None),
+        (["0.ply", "._0.ply", "1.ply"], None),  # hidden files are none of the sequence
+        (["20250101_235959.ply", "20250102_000000.ply"], None),
+    ],
+)
+def test_a_folder_is_one_sequence_without_gaps(tmp_path, names, said):
+    for name in names:
+        (tmp_path / name).touch()
+    if said is None:
+        visible = [n for n in names if not n.startswith(".")]
+        assert [Path(n).name for n in open_scans(tmp_path, ScanSettings()).names] == visible
+        return
+    with pytest.raises(GeometryError, match=re.escape(f"{tmp_path}: ") + ".*" + re.escape(said)):
+        open_scans(tmp_path, ScanSettings())
+
+
+def cloud_of(points: np.ndarray) -> o3d.geometry.PointCloud:
+    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+
+
+def test_nan_points_are_missing_in_every_format(tmp_path):
+    points = np.arange(18.0).reshape(6, 3)
+    points[2, 1] = np.nan
+    expected = points[[0, 1, 3, 4, 5]]
+    o3d.io.write_point_cloud(str(tmp_path / "a.ply"), cloud_of(points))
+    np.savez(tmp_path / "b.npz", points=points)
+    np.savez(tmp_path / "c.npz", points=[points, np.full((6, 3), np.nan)])
+    for name in ("a.ply", "b.npz", "c.npz"):
+        np.testing.assert_array_equal(open_scans(tmp_path / name, ScanSettings()).points(0), expected)
+    with pytest.raises(GeometryError, match=r"c\.npz, frame 1: all 6 points are missing \(NaN\)"):
+        open_scans(tmp_path / "c.npz", ScanSettings()).points(1)
+    box = trimesh.creation.box(extents=(2, 4, 6))
+    box.vertices[0] = np.nan
+    box.export(tmp_path / "d.ply")
+    assert np.isfinite(open_scans(tmp_path / "d.ply", ScanSettings()).points(0)).all()
+
+
+def test_points_that_can_be_no_surface_are_refused(tmp_path):
+    np.savez(tmp_path / "none.npz", points=np.zeros((0, 5, 3)))
+    with pytest.raises(GeometryError, match=r"none\.npz: holds no frames.*\(0, 5, 3\)"):
+        open_scans(tmp_path / "none.npz", ScanSettings())
+    np.savez(tmp_path / "same.npz", points=np.ones((3, 50, 3)))
+    with pytest.raises(GeometryError, match=r"same\.npz, frame 1: all 50 points coincide"):
+        open_scans(tmp_path / "same.npz", ScanSettings()).points(1)
+    np.save(tmp_path / "far.npy", [[0, 0, 0], [np.inf, 0, 0]])
+    with pytest.raises(GeometryError, match=r"far\.npy, frame 0: 1 points are infinite"):
+        open_scans(tmp_path / "far.npy", ScanSettings()).points(0)
+    box = trimesh.creation.box(extents=(2, 4, 6))
+    box.vertices[0] = np.inf
+    box.export(tmp_path / "far.ply")
+    with pytest.raises(GeometryError, match=r"far\.ply: .*infinite"):
+        open_scans(tmp_path / "far.ply", ScanSettings()).points(0)
 
 
 def test_spacing_is_the_mean_distance_to_the_nearest_point(tmp_path):
@@ -97,5 +164,5 @@ def test_bad_scans_are_named(tmp_path):
         open_scans(tmp_path / "d.npz", ScanSettings())
     (tmp_path / "e").mkdir()
     np.savez(tmp_path / "e/0.npz", points=np.array([[0, 0, np.nan]]))
-    with pytest.raises(GeometryError, match="1 points are not finite"):
+    with pytest.raises(GeometryError, match="all 1 points are missing"):
         open_scans(tmp_path / "e", ScanSettings()).points(0)

@@ -72,6 +72,8 @@ def test_feature_gradients_of_a_linear_field():
 def test_too_few_points_say_so():
     with pytest.raises(GeometryError, match="more than 9 are needed"):
         point_set(np.zeros((5, 3)), 100, 9)
+    with pytest.raises(GeometryError, match="frame 1: a surface of 5 distinct points"):
+        track_nodes(lambda t: capsule(900)[: (900, 5)[t]], 2, SMALL)
 
 
 def test_samples_ride_rigidly():
@@ -313,6 +315,14 @@ def test_motion_in_a_single_frame_of_a_few_is_seen(still):
     tracks = track_nodes(lambda t: capsule(1500) + (t == still) * shift, still + 1, SMALL)
     moved = tracks.positions[:, still] - tracks.positions[:, 0]
     np.testing.assert_allclose(np.nanmedian(moved, axis=0), shift, atol=0.01)
+
+
+def test_coincident_points_are_one():
+    points = capsule(300)
+    once, often = (point_set(np.tile(points, (n, 1)), 2000, 9) for n in (1, 12))
+    np.testing.assert_array_equal(often.positions, once.positions)
+    with pytest.raises(GeometryError, match="frame 0: a surface of 8 distinct points"):
+        track_nodes(lambda t: np.tile(points[:8], (20, 1)), 2, SMALL)
 
 
 def test_no_frames():

@@ -286,6 +286,38 @@ def test_any_geometry_file_gets_a_picture(made: Made, tmp_path: Path) -> None:
             render_file(tmp_path / name)
 
 
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "no PLY file"),
+        (b"garbage", "no PLY file"),
+        (b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n", "neither triangles nor points"),
+        (b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n", "1 lines are missing"),
+        (b"ply\nformat ascii 1.0\ncomment voxel_size\nelement vertex 0\nend_header\n", "holds no voxels"),
+    ],
+)
+def test_bad_ply_is_told_in_one_line(tmp_path: Path, capfd, content: bytes, said: str) -> None:
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(GeometryError, match=rf"a\.ply: .*{said}"):
+        render_file(tmp_path / "a.ply")
+    assert "".join(capfd.readouterr()) == ""
+
+
+@pytest.mark.parametrize("name", ["p8.txt", "p8", "scan.obj"])
+def test_picture_of_no_picture_name_is_refused_before_any_work(tmp_path: Path, name: str) -> None:
+    (tmp_path / "scan.obj").touch()
+    with pytest.raises(RunError, match=rf"{name}: no name of a picture; expected .*\.png"):
+        render_file(tmp_path / "scan.obj", tmp_path / name)
+
+
+def test_clouds_are_drawn_without_a_word(tmp_path: Path, capfd) -> None:
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    o3d.io.write_point_cloud(str(tmp_path / "a.ply"), cloud)
+    render_file(tmp_path / "a.ply")
+    assert "".join(capfd.readouterr()) == ""
+
+
 def test_points_without_colours_or_bodies(tmp_path: Path) -> None:
     positions = np.array([[0, 0, 0], [1, 2, 3], [np.nan, 0, 0]], np.float32)
     o3d.t.io.write_point_cloud(str(tmp_path / "a.ply"), o3d.t.geometry.PointCloud(o3d.core.Tensor(positions)))

@@ -1,0 +1,109 @@
+"""Geometry files read by Open3D, which fills what is missing of a broken file with anything and says so on the screen.
+
+Here a PLY that isn't whole is refused beforehand, and Open3D is silent.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, TypeVar
+
+import open3d as o3d
+
+from geomocap.errors import GeometryError
+
+T = TypeVar("T")
+
+_BYTES = {
+    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
+    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
+    **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
+    **dict.fromkeys(("double", "float64"), 8),
+}
+_HEADER_LIMIT = 1 << 16  # bytes
+_alone = threading.Lock()  # the verbosity is one for all threads
+
+
+def read_by_open3d(read: Callable[[Path], T], path: Path) -> T:
+    """Read a geometry file by one of Open3D's functions.
+
+    Raises
+    ------
+    GeometryError
+        If it is a PLY that isn't whole.
+    """
+    if path.suffix.lower() == ".ply":
+        check_ply(path)
+    with _alone, o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        return read(path)
+
+
+@dataclass
+class _Element:
+    """An element of a PLY: its number, and for each property its bytes, or those of a list's length and items."""
+
+    name: str
+    count: int
+    properties: list[tuple[int, ...]] = field(default_factory=list)
+
+
+def check_ply(path: Path) -> None:
+    """Refuse a PLY whose header can't be read or whose data end too early.
+
+    Raises
+    ------
+    GeometryError
+    """
+    try:
+        with path.open("rb") as file:
+            head, end, _ = file.read(_HEADER_LIMIT).partition(b"end_header")
+            file.seek(len(head) + len(end))
+            kind, elements = _header(head if end else b"")
+            if kind == "ascii":
+                lines = sum(1 for line in file.read().splitlines() if line.strip())
+                missing = sum(e.count for e in elements if e.properties) - lines
+            else:
+                file.readline()
+                missing = _missing(file.read(), elements, "little" if "little" in kind else "big")
+    except OSError as error:
+        raise GeometryError(f"{path}: can't be read ({error.strerror})") from None
+    except (ValueError, KeyError, IndexError):
+        raise GeometryError(f"{path}: no PLY file, its header can't be read; make it again") from None
+    if missing > 0:
+        what = "lines" if kind == "ascii" else "bytes"
+        raise GeometryError(f"{path}: PLY ends too early, at least {missing} {what} are missing; make it again")
+
+
+def _header(head: bytes) -> tuple[str, list[_Element]]:
+    first, *lines = head.decode("ascii", "replace").splitlines()
+    kind, elements = "", list[_Element]()
+    for word, *rest in (line.split() for line in lines if line.strip()):
+        if word == "format":
+            kind = rest[0]
+        elif word == "element":
+            elements.append(_Element(rest[0], int(rest[1])))
+        elif word == "property":
+            types = rest[1:3] if rest[0] == "list" else rest[:1]
+            elements[-1].properties.append(tuple(_BYTES[t] for t in types))
+    if first.strip() != "ply" or kind not in ("ascii", "binary_little_endian", "binary_big_endian"):
+        raise ValueError
+    return kind, elements
+
+
+def _missing(body: bytes, elements: list[_Element], order: Literal["little", "big"]) -> int:
+    """Count the bytes that binary elements need beyond those that are there."""
+    at = 0
+    for element in elements:
+        if all(len(p) == 1 for p in element.properties):
+            at += element.count * sum(p[0] for p in element.properties)
+            continue
+        for _ in range(element.count):
+            for size, *item in element.properties:
+                length = int.from_bytes(body[at : at + size], order) if item else 0
+                at += size + length * sum(item)
+            if at > len(body):
+                break
+    return at - len(body)

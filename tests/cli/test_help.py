@@ -1,0 +1,33 @@
+"""What `--help` says."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import typer
+
+from geomocap.cli.app import app
+
+COMMANDS = typer.main.get_command(app).commands
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_no_placeholder_is_taken_as_markup(name):
+    command = COMMANDS[name]
+    for text in (command.help, *(getattr(p, "help", None) for p in command.params)):
+        assert not re.search(r"<\w+>", re.sub("`[^`]*`", "", text or "")), text
+
+
+def test_placeholders_are_shown(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    for name, said in (("calibrate", "CAPTURE/bar/<camera>.mp4"), ("synthesize", "videos/<camera>.mp4")):
+        with pytest.raises(SystemExit):
+            app([name, "--help"])
+        assert said in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["review", "keypoints", "export", "evaluate"])
+def test_a_run_that_must_be_there_is_not_said_to_be_made(name):
+    run = next(p for p in COMMANDS[name].params if p.name == "run")
+    assert "Run folder" in run.help and "made" not in run.help

@@ -1,0 +1,55 @@
+"""Files that Open3D reads: PLY refused if not whole, and nothing on the screen."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+import pytest
+import trimesh
+
+from geomocap.errors import GeometryError
+from geomocap.geometry import BodyPoints, Voxels
+from geomocap.open3d_files import check_ply, read_by_open3d
+
+HEADER = b"ply\nformat ascii 1.0\nelement vertex"
+
+
+@pytest.mark.parametrize("encoding", ["binary", "ascii"])
+def test_truncated_meshes_are_refused(tmp_path, encoding):
+    file = tmp_path / "ball.ply"
+    trimesh.creation.icosphere(subdivisions=1).export(file, encoding=encoding)
+    check_ply(file)
+    whole = file.read_bytes()
+    for cut in (40, len(whole) // 2):
+        file.write_bytes(whole[:-cut])
+        with pytest.raises(GeometryError, match=r"ball\.ply: PLY ends too early, at least \d+ (lines|bytes)"):
+            check_ply(file)
+
+
+def test_files_of_a_run_are_whole(tmp_path):
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    BodyPoints(points, np.zeros(20, int)).write(tmp_path / "bodies.ply")
+    Voxels(np.eye(3, dtype=np.int32), np.zeros((3, 3), np.uint8), np.zeros(3), 0.1).write(tmp_path / "voxels.ply")
+    for name in ("bodies.ply", "voxels.ply"):
+        file = tmp_path / name
+        check_ply(file)
+        file.write_bytes(file.read_bytes()[:-1])
+        with pytest.raises(GeometryError, match="at least 1 bytes are missing"):
+            check_ply(file)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"garbage", HEADER + b" 1\n", HEADER + b" x\nend_header\n"],
+)
+def test_what_is_no_ply_is_named(tmp_path, content):
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(GeometryError, match=r"a\.ply: no PLY file"):
+        check_ply(tmp_path / "a.ply")
+
+
+def test_reading_prints_nothing_and_leaves_the_verbosity(tmp_path, capfd):
+    before = o3d.utility.get_verbosity_level()
+    (tmp_path / "a.pcd").write_text("nonsense")
+    assert not read_by_open3d(o3d.io.read_point_cloud, tmp_path / "a.pcd").has_points()
+    assert "".join(capfd.readouterr()) == "" and o3d.utility.get_verbosity_level() == before
