@@ -29,6 +29,7 @@ from geomocap.settings import Settings
 MESH_ENDINGS = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 CLOUD_ENDINGS = (".ply", ".pcd", ".xyz", ".pts")
 ARRAY_ENDINGS = (".npz", ".npy")
+_FARTHEST = 1e5  # extents from the origin; ten times farther the equations of motion lose their last digits
 
 
 class ScanSettings(Settings):
@@ -74,7 +75,8 @@ class Scans:
         Raises
         ------
         GeometryError
-            If the scan can't be read, holds no points, infinite coordinates, or only points that coincide.
+            If the scan can't be read, holds no points, infinite coordinates, only points that coincide, or points too
+            far from the origin for their extent.
         """
         name = self.names[frame]
         points = np.ascontiguousarray(self.read(frame), dtype=np.float64) * self.settings.scale
@@ -88,6 +90,12 @@ class Scans:
             raise GeometryError(f"{name}: {infinite} points are infinite; remove them, or set them to NaN")
         if len(points) > 1 and (points == points[0]).all():
             raise GeometryError(f"{name}: all {len(points)} points coincide; is the file right?")
+        away, extent = np.linalg.norm(points.mean(axis=0)), np.linalg.norm(np.ptp(points, axis=0))
+        if len(points) > 1 and away > _FARTHEST * extent:
+            raise GeometryError(
+                f"{name}: points lie {away / extent:.1e} times their extent from the origin, more than {_FARTHEST:.0e}: "
+                "motions would get lost in rounding; subtract the same offset from all scans"
+            )
         return points
 
     @cached_property

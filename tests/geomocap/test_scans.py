@@ -116,6 +116,9 @@ def test_points_that_can_be_no_surface_are_refused(tmp_path):
     np.save(tmp_path / "far.npy", [[0, 0, 0], [np.inf, 0, 0]])
     with pytest.raises(GeometryError, match=r"far\.npy, frame 0: 1 points are infinite"):
         open_scans(tmp_path / "far.npy", ScanSettings()).points(0)
+    np.save(tmp_path / "away.npy", np.eye(3) + 1e7)
+    with pytest.raises(GeometryError, match=r"away\.npy, frame 0: .* from the origin.*subtract the same offset"):
+        open_scans(tmp_path / "away.npy", ScanSettings()).points(0)
     box = trimesh.creation.box(extents=(2, 4, 6))
     box.vertices[0] = np.inf
     box.export(tmp_path / "far.ply")
