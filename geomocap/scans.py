@@ -93,7 +93,7 @@ class Scans:
         away, extent = np.linalg.norm(points.mean(axis=0)), np.linalg.norm(np.ptp(points, axis=0))
         if len(points) > 1 and away > _FARTHEST * extent:
             raise GeometryError(
-                f"{name}: points lie {away / extent:.1e} times their extent from the origin, more than {_FARTHEST:.0e}: "
+                f"{name}: points lie {away / extent:.1e} times their extent from the origin, over {_FARTHEST:.0e}: "
                 "motions would get lost in rounding; subtract the same offset from all scans"
             )
         return points
