@@ -21,7 +21,7 @@ from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.segmentation.sight_depths import find_bodies_and_depths
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
 
-_UNSURE_DEG = 30.0  # 4 to 8 with eight cameras, about 20 with four that still see the bodies
+_UNSURE_DEG = 30.0  # 3 to 8 with eight cameras; with four that show the bodies 12, in a cluttered room 29
 
 
 def unsure_turns(bodies: MotionBodies) -> list[str]:
