@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,11 @@ from geomocap.articulation.refinement import RefinementSettings
 from geomocap.articulation.take_tracking import TakeSettings
 from geomocap.carving.settings import CarvingSettings
 from geomocap.cloud.settings import CloudSettings
-from geomocap.errors import SettingsError
 from geomocap.export.settings import ExportSettings
 from geomocap.scans import ScanSettings
 from geomocap.segmentation.motion_bodies import MotionBodiesSettings
 from geomocap.segmentation.settings import SegmentationSettings
-from geomocap.settings import Settings, check_settings
+from geomocap.settings import Settings, load_settings
 from geomocap.silhouettes import SilhouetteSettings
 from geomocap.skeleton.motion_skeleton import MotionSkeletonSettings
 from geomocap.skeleton.settings import SkeletonSettings
@@ -62,23 +60,4 @@ def load_config(path: Path | None = None, overrides: dict[str, Any] | None = Non
     SettingsError
         If the file can't be read, a key is unknown or a value out of range.
     """
-    values: dict[str, Any] = {}
-    if path is not None:
-        try:
-            values = tomllib.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise SettingsError(f"{path}: can't be read ({error.strerror})") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise SettingsError(f"{path}: not valid TOML ({error})") from None
-        if "config" in values and "geomocap" in values:  # a run.toml
-            values = values["config"]
-    return check_settings(Config, _merge(values, overrides or {}), str(path) if path is not None else "")
-
-
-def _merge(values: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
-    """Return nested tables with those of `overrides` put over them."""
-    merged = dict(values)
-    for key, value in overrides.items():
-        below = merged.get(key)
-        merged[key] = _merge(below, value) if isinstance(value, dict) and isinstance(below, dict) else value
-    return merged
+    return load_settings(Config, path, overrides)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tomllib
+from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
@@ -69,3 +71,41 @@ def check_settings(model: type[Model], values: dict[str, Any], where: str = "") 
         if not first["loc"]:
             raise SettingsError(f"{start}{first['msg'].removeprefix('Value error, ')}") from None
         raise SettingsError(f"{start}setting {key} = {first['input']!r}: {first['msg']}") from None
+
+
+def load_settings(model: type[Model], path: Path | None = None, overrides: dict[str, Any] | None = None) -> Model:
+    """Read settings from a TOML file, override single keys, and check them all.
+
+    Parameters
+    ----------
+    model : subclass of Settings
+    path : Path, optional
+        A settings file, or the `run.toml` of a run that is to be repeated.
+    overrides : dict, optional
+        Nested as the file is.
+
+    Raises
+    ------
+    SettingsError
+        If the file can't be read, a key is unknown or a value out of range.
+    """
+    values: dict[str, Any] = {}
+    if path is not None:
+        try:
+            values = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise SettingsError(f"{path}: can't be read ({error.strerror})") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise SettingsError(f"{path}: not valid TOML ({error})") from None
+        if "config" in values and "geomocap" in values:  # a run.toml
+            values = values["config"]
+    return check_settings(model, _merge(values, overrides or {}), str(path) if path is not None else "")
+
+
+def _merge(values: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
+    """Return nested tables with those of `overrides` put over them."""
+    merged = dict(values)
+    for key, value in overrides.items():
+        below = merged.get(key)
+        merged[key] = _merge(below, value) if isinstance(value, dict) and isinstance(below, dict) else value
+    return merged

@@ -17,15 +17,10 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from geomocap.config import Config, load_config
-from geomocap.settings import Settings, check_settings
+from geomocap.settings import Settings, load_settings
 
 _PREFIX, _SEPARATOR = "set__", "__"
 Command = Callable[..., None]
-
-ConfigFile = Annotated[
-    Path | None,
-    typer.Option("--config", metavar="FILE.toml", help="Settings file; a run's own run.toml repeats that run."),
-]
 
 
 def with_settings(*sections: str) -> Callable[[Command], Command]:
@@ -34,27 +29,29 @@ def with_settings(*sections: str) -> Callable[[Command], Command]:
     The command gets the merged settings as its keyword argument `config`.
     """
     fields = [(path, field) for path, field in _leaves(Config, ()) if path[0] in sections]
-    return _with_options("config", fields, load_config, with_file=True)
+    return _with_options("config", fields, load_config, "Settings file; a run's own run.toml repeats that run.")
 
 
 def with_options_of(model: type[Settings]) -> Callable[[Command], Command]:
-    """Give a command a flag `--key` for each setting of a model; it gets them as its keyword argument `settings`."""
-    return _with_options(
-        "settings", list(_leaves(model, ())), lambda _, values: check_settings(model, values), with_file=False
-    )
+    """Give a command `--config FILE.toml` and a flag `--key` for each setting of a model.
+
+    The command gets the merged settings as its keyword argument `settings`.
+    """
+    build = functools.partial(load_settings, model)
+    return _with_options("settings", list(_leaves(model, ())), build, "Settings file: keys as below, without tables.")
 
 
 def _with_options(
     name: str,
     fields: Sequence[tuple[tuple[str, ...], FieldInfo]],
     build: Callable[[Path | None, dict[str, Any]], Settings],
-    with_file: bool,
+    file_help: str,
 ) -> Callable[[Command], Command]:
     def decorate(command: Command) -> Command:
         signature = inspect.signature(command, eval_str=True)
         parameters = [p for p in signature.parameters.values() if p.name != name]
-        if with_file:
-            parameters.append(_parameter("config_file", ConfigFile))
+        file = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml", help=file_help)]
+        parameters.append(_parameter("config_file", file))
         parameters += [_parameter(_PREFIX + _SEPARATOR.join(path), _option(path, field)) for path, field in fields]
 
         @functools.wraps(command)
@@ -68,7 +65,7 @@ def _with_options(
                     for part in tables:
                         table = table.setdefault(part, {})
                     table[key] = _parse(text)
-            arguments[name] = build(arguments.pop("config_file", None), values)
+            arguments[name] = build(arguments.pop("config_file"), values)
             command(**arguments)
 
         wrapper.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]

@@ -10,6 +10,7 @@ import pycolmap
 import pytest
 
 from geomocap.cameras import Rig
+from geomocap.capture import Capture
 from tests.cli.conftest import SETTINGS, last_line
 
 
@@ -119,6 +120,16 @@ def test_unknown_setting(capture, geomocap, tmp_path):
     (tmp_path / "a.toml").write_text("[carving]\nresolutoin = 64\n")
     result = geomocap("run", capture, tmp_path / "run", "--config", tmp_path / "a.toml", check=False)
     assert "unknown setting carving.resolutoin" in refused(result)
+
+
+def test_settings_file_of_a_command_with_settings_of_its_own(geomocap, tmp_path):
+    (tmp_path / "a.toml").write_text("frames = 1\ncameras = 2\nwidth = 64\nheight = 48\n")
+    geomocap("synthesize", "figure", tmp_path / "made", "--config", tmp_path / "a.toml", "--cameras", 3)
+    made = Capture.open(tmp_path / "made")
+    assert (made.n_frames, len(made.cameras)) == (1, 3)  # a flag goes before the file
+    (tmp_path / "a.toml").write_text("[carving]\nresolution = 64\n")
+    result = geomocap("synthesize", "figure", tmp_path / "other", "--config", tmp_path / "a.toml", check=False)
+    assert "a.toml: unknown setting carving" in refused(result)
 
 
 def test_run_folder_that_can_not_be_written(capture, geomocap, tmp_path):

@@ -49,24 +49,16 @@ def follow(run: Run, frames: int) -> None:
         (run.path / name).touch()
 
 
-def test_key_points_go_with_the_bodies_they_were_followed_on(job):
-    first = job(scanned(6), M3)
-    segment(first, "scans")
-    follow(first.run, 6)
-    motion_files(first, "scans")
-    assert "tip" in read_trc(first.run.path / "motion.trc").names
-    motion_files(job(scanned(5), M3), "scans")
-    assert not [name for name in KEYPOINT_FILES if (first.run.path / name).exists()]
-    assert (first.run.path / "keypoints.toml").exists()
-    assert "tip" not in read_trc(first.run.path / "motion.trc").names
-
-
-def test_motion_files_are_written_anew_with_key_points_followed_since(job):
+def test_motion_files_hold_key_points_followed_since_and_these_go_with_their_bodies(job):
     done = job(scanned(6), M3)
     motion_files(done, "scans")
     follow(done.run, 6)
     motion_files(done, "scans")
     assert "tip" in read_trc(done.run.path / "motion.trc").names
+    motion_files(job(scanned(5), M3), "scans")
+    assert not [name for name in KEYPOINT_FILES if (done.run.path / name).exists()]
+    assert (done.run.path / "keypoints.toml").exists()
+    assert "tip" not in read_trc(done.run.path / "motion.trc").names
 
 
 def test_one_scan_leaves_no_motion_of_the_sequence_before_it(job):

@@ -143,7 +143,7 @@ def test_depths_of_a_single_camera_do_not_draw_the_model_away(model):
     true, places = take_of(model)
     found = track_take(model, lambda t: (places[t], None), len(places), SPACING, 2, unsure(places))
     apart = model.linkage.joint_positions(found.bodies) - model.linkage.joint_positions(true)
-    assert np.linalg.norm(apart, axis=2).max() < 0.025
+    assert np.linalg.norm(apart, axis=2).max() < 0.025  # of 0.11 if paths were as sure in depth
 
 
 def test_turns_are_seen_across_the_line_of_sight(model):
@@ -153,7 +153,7 @@ def test_turns_are_seen_across_the_line_of_sight(model):
     skin = attach_paths(model, true, paths, 0.2)
     found = body_motion(model.linkage, turned_by_paths(model.linkage, motion, bodies, skin, paths, 1e-4))
     turns = [np.swapaxes(m.rotations[:, 2], 1, 2)[:-1] @ m.rotations[1:, 2] for m in (found, true)]
-    assert np.rad2deg(turn_angles(np.swapaxes(turns[0], 1, 2) @ turns[1])).mean() < 2.5
+    assert np.rad2deg(turn_angles(np.swapaxes(turns[0], 1, 2) @ turns[1])).mean() < 2.5  # of 5°
 
 
 def rolled(model, true, about):

@@ -3,15 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
-from geomocap.carving.views import PinholeViews
-from geomocap.errors import GeometryError
-from geomocap.geometry import Voxels
-from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.patch_kernel import align_patches
-from geomocap.tracking.patch_motion import lift_flow
 from geomocap.tracking.patch_search import renewed
 from geomocap.tracking.patch_templates import inverse_diagonal
 from geomocap.tracking.patch_tracking import track_surface
@@ -48,52 +42,6 @@ def seeds(views):
     return seed_patches(views[0], np.zeros((0, 3)), spacing, SETTINGS, np.random.default_rng(0))
 
 
-def test_frame_views_have_depth_in_front_of_the_surface_and_no_background(scene, views):
-    view = views[0]
-    assert view.levels.shape == (2, 6, 120, 160)
-    assert_allclose(np.linalg.norm(view.projections[:, 2, :3], axis=1), 1)
-    top = np.array([[0.2, 0, 0]])  # faces camera 0
-    depth = view.project(top)[1]
-    assert_allclose(view.depths(top)[1][0, 0], depth[0, 0], atol=0.015)
-    assert np.isnan(view.depths(np.array([[0.0, 0, 3]]))[1]).all()
-    # the dark background (40) doesn't bleed into the rim
-    rim = (view.masks > 0) & ~np.stack([binary_erosion(m) for m in view.masks])
-    inside = (view.masks > 0) & ~rim
-    assert abs(view.levels[0][rim].mean() - view.levels[0][inside].mean()) < 8
-
-
-def test_points_outside_a_silhouette_are_not_the_subject(views):
-    points = np.array([[0.0, 0, 0], [0.19, 0, 0], [0.3, 0, 0], [0, 0, -50.0]])
-    assert views[0].may_be_subject(points).tolist() == [True, True, False, True]  # the last one nobody sees
-
-
-def test_frame_views_refuse_images_of_another_size(scene):
-    images, masks = scene.images(0)
-    views = PinholeViews.of(scene.projections(), masks)
-    with pytest.raises(GeometryError, match="silhouettes"):
-        FrameViews.of(views, images[:, :-1], scene.voxels(0))
-    nothing = Voxels(np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8), np.zeros(3), 0.01)
-    with pytest.raises(GeometryError, match="without surface"):
-        FrameViews.of(views, images, nothing)
-
-
-def test_reduced_frames_show_the_same_scene_in_larger_pixels(scene):
-    fine = MovingEllipsoid(width=321, height=243, focal=520.0)
-    images, masks = fine.images(0)
-    views = PinholeViews.of(fine.projections(), masks)
-    full = FrameViews.of(views, images, fine.voxels(0))
-    half = FrameViews.of(views, images, fine.voxels(0), reduction=2)
-    assert half.levels.shape == (2, 6, 121, 160)
-    points = np.array([[0.1, 0.05, 0.1], [-0.1, 0, 0]])
-    # COLMAP pixels halve; array indices are half a pixel less
-    assert_allclose(half.project(points)[0] + 0.5, (full.project(points)[0] + 0.5) / 2)
-    assert_allclose(half.project(points)[1], full.project(points)[1])
-    mean = full.levels[1, 0, :242, :320].reshape(121, 2, 160, 2).mean(axis=(1, 3))
-    inside = np.stack([binary_erosion(half.masks[0], iterations=4)])[0]
-    assert np.corrcoef(mean[inside], half.levels[1, 0][inside])[0, 1] > 0.98
-    assert abs(half.masks.sum() * 4 / full.masks.sum() - 1) < 0.01
-
-
 def test_images_are_reduced_until_patches_cover_the_surface_twice(views):
     few = TrackingSettings(n_patches=100, radius_px=2)
     spacing, pixel = seed_spacing(views[0], 100), np.median(views[0].pixel_size(views[0].surface))
@@ -107,10 +55,6 @@ def test_patches_are_as_wide_as_their_distance_within_bounds(views):
     widths = [patch_radius(views[0], px * pixel, settings) for px in (1.0, 4.2, 20.0)]
     assert widths == [3, 4, 6]
     assert patch_radius(views[0], pixel, TrackingSettings(radius_px=2)) == 2
-
-
-def test_pixel_size_is_depth_by_focal_length(views):
-    assert_allclose(views[0].pixel_size(np.zeros((1, 3))), np.sqrt(1 + 0.09) / 260, rtol=1e-9)
 
 
 def test_spread_keeps_distance_and_covers():
@@ -360,60 +304,3 @@ def test_variances_are_the_diagonal_of_the_inverse():
     variances = np.empty(6)
     inverse_diagonal(np.linalg.cholesky(normal), variances)
     assert_allclose(variances, np.diag(np.linalg.inv(normal)), rtol=1e-12)
-
-
-def test_projections_and_surface_depths_are_those_of_numpy(views):
-    view = views[0]
-    rng = np.random.default_rng(7)
-    points = np.concatenate([view.surface[::5], rng.normal(scale=4.0, size=(200, 3))])  # behind and beside cameras too
-    image = np.einsum("cij,nj->nci", view.projections[:, :, :3], points) + view.projections[:, :, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        true = np.where(image[:, :, 2:] > 0, image[:, :, :2] / image[:, :, 2:], np.nan)
-    pixel, depth = view.project(points)
-    assert_allclose(pixel, true, rtol=1e-9, atol=1e-9)
-    assert_allclose(depth, image[:, :, 2], atol=1e-12)
-    _, H, W = view.masks.shape
-    surface = np.full(depth.shape, np.nan)
-    allowed = np.ones(len(points), bool)
-    for n, c in np.ndindex(depth.shape):
-        if np.isfinite(true[n, c]).all():
-            x, y = np.rint(true[n, c]).astype(int)
-            if 0 <= x < W and 0 <= y < H:
-                surface[n, c] = view.depth[c, y, x]
-                allowed[n] &= view.allowed[c, y, x] != 0
-    assert np.isfinite(surface).any() and not allowed.all() and np.isnan(true).any()
-    assert_allclose(view.depths(points)[1], np.where(np.isfinite(surface), surface, np.nan))
-    assert np.array_equal(view.may_be_subject(points), allowed)
-
-
-def _lifted_by_numpy(view, positions, flow):
-    P = view.projections
-    pixel, depth = view.project(positions)
-    slope = (P[None, :, :2, :3] - pixel[..., None] * P[None, :, 2:, :3]) / depth[:, :, None, None]
-    known = np.isfinite(flow).all(axis=2)
-    weight, flow, shifts = known.astype(float), np.where(known[..., None], flow, 0.0), []
-    for n in range(len(positions)):
-        rows, values = slope[n].reshape(-1, 3), flow[n].reshape(-1)
-        for _ in range(4):
-            weights = np.repeat(weight[n], 2)
-            shift = np.linalg.solve(
-                (rows * weights[:, None]).T @ rows + np.eye(3) / 0.3**2, (rows * weights[:, None]).T @ values
-            )
-            miss = np.linalg.norm((values - rows @ shift).reshape(-1, 2), axis=1)
-            weight[n] = known[n] / (1 + (miss / 1.5) ** 2)
-        shifts.append(shift)
-    return np.array(shifts)
-
-
-def test_lifted_flow_is_that_of_numpy(views):
-    view = views[0]
-    rng = np.random.default_rng(6)
-    positions = view.surface[rng.choice(len(view.surface), 40, replace=False)]
-    true = 0.02 * rng.normal(size=positions.shape)
-    flow = view.project(positions + true)[0] - view.project(positions)[0]
-    flow[rng.random(flow.shape[:2]) < 0.2] = np.nan
-    flow[8, 0] += 20.0  # a camera that follows something else
-    # the median over the patches that follow is that of each patch alone if all have the same place
-    for n in range(0, 40, 8):
-        found = lift_flow(view, np.repeat(positions[n : n + 1], 9, axis=0), np.repeat(flow[n : n + 1], 9, axis=0))
-        assert_allclose(found[0], _lifted_by_numpy(view, positions[n : n + 1], flow[n : n + 1])[0], atol=1e-9)
