@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, TypeVar
 
+import numpy as np
 import open3d as o3d
 
 from geomocap.errors import GeometryError
@@ -100,6 +101,10 @@ def _missing(body: bytes, elements: list[_Element], order: Literal["little", "bi
         if all(len(p) == 1 for p in element.properties):
             at += element.count * sum(p[0] for p in element.properties)
             continue
+        end = _end_of_alike(body, at, element, order)
+        if end is not None:
+            at = end
+            continue
         for _ in range(element.count):
             for size, *item in element.properties:
                 length = int.from_bytes(body[at : at + size], order) if item else 0
@@ -107,3 +112,18 @@ def _missing(body: bytes, elements: list[_Element], order: Literal["little", "bi
             if at > len(body):
                 break
     return at - len(body)
+
+
+def _end_of_alike(body: bytes, at: int, element: _Element, order: Literal["little", "big"]) -> int | None:
+    """Where elements end that begin at a byte, if their lists are all as long as the first's, as those of triangles."""
+    stride, lengths = 0, []
+    for size, *item in element.properties:
+        start = at + stride
+        length = int.from_bytes(body[start : start + size], order) if item else 0
+        lengths += [slice(stride, stride + size)] if item else []
+        stride += size + length * sum(item)
+    if at + element.count * stride > len(body):
+        return None
+    rows = np.frombuffer(body, np.uint8, element.count * stride, at).reshape(-1, stride)
+    alike = all((rows[:, part] == rows[:1, part]).all() for part in lengths)
+    return at + element.count * stride if alike else None

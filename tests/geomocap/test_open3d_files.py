@@ -26,6 +26,17 @@ def test_truncated_meshes_are_refused(tmp_path, encoding):
             check_ply(file)
 
 
+def test_polygons_of_several_lengths_are_counted_one_by_one(tmp_path):
+    header = b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\n"
+    header += b"element face 3\nproperty list uchar int vertex_indices\nproperty uchar red\nend_header\n"
+    faces = [bytes([n]) + bytes(4 * n + 1) for n in (3, 4, 3)]
+    (tmp_path / "a.ply").write_bytes(header + b"".join(faces))
+    check_ply(tmp_path / "a.ply")
+    (tmp_path / "a.ply").write_bytes(header + b"".join(faces)[:-1])
+    with pytest.raises(GeometryError, match="at least 1 bytes are missing"):
+        check_ply(tmp_path / "a.ply")
+
+
 def test_files_of_a_run_are_whole(tmp_path):
     points = np.random.default_rng(0).normal(size=(20, 3))
     BodyPoints(points, np.zeros(20, int)).write(tmp_path / "bodies.ply")
