@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from viz.drawing import sheet
 from viz.figures import WIDTH, figure_of, plot
@@ -48,6 +49,7 @@ def reliability(share: np.ndarray, fps: float | None) -> Figure:
     ax.grid(visible=False)
     ax.set_xlabel("time (s)" if fps else "frame")
     ax.set_ylabel("body")
+    ax.yaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_title("share of a body's samples that are measured and follow it")
     figure.colorbar(image, ax=ax, pad=0.01)
     return figure
