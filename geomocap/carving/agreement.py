@@ -15,18 +15,29 @@ from geomocap.carving.views import PinholeViews
 from geomocap.errors import CalibrationError, GeometryError
 
 LOW_COVERAGE = 0.5  # silhouettes of which half the cameras explain less than this are suspicious
+ENOUGH = 4  # cameras that see the subject enclose it, however many others there are
+ALL = HullSettings(outside="empty")  # a point counts where all cameras see it
 CLEAR_GAIN = 0.3  # and a camera is to blame if without it the others' coverage is that much higher
 
 
-def check_cameras(views: PinholeViews) -> None:
+def check_cameras(views: PinholeViews, settings: HullSettings) -> None:
     """Check that the cameras look at one common region; silhouettes are not looked at.
 
     Raises
     ------
     CalibrationError
-        If nothing is seen by all cameras, naming the camera that looks away where there is one.
+        If nothing is seen by all cameras, naming the camera that looks away where there is one; where what is outside a
+        view may be unseen, only if nothing is seen by as many cameras as must have a say.
     """
-    if len(views) < 2 or _share_view(views):
+    if len(views) < 2:
+        return
+    if settings.outside != "empty":
+        if not _share_view(views, HullSettings(outside="unseen", min_views=settings.min_views)):
+            raise CalibrationError(
+                f"no point is seen by {settings.min_views} of the cameras {', '.join(views.names)}; check their poses"
+            )
+        return
+    if _share_view(views):
         return
     away = [name for c, name in enumerate(views.names) if len(views) > 2 and _share_view(views.without(c))]
     if len(away) == 1:
@@ -36,21 +47,24 @@ def check_cameras(views: PinholeViews) -> None:
         )
     raise CalibrationError(
         f"no point is seen by all cameras ({', '.join(views.names)}); check their poses, or set carving.hull.outside "
-        "to 'unseen'"
+        "to 'auto'"
     )
 
 
 def check_silhouettes(
-    views: PinholeViews, frame: int, tolerance: int = 0, given: Mapping[str, Path] | None = None
+    views: PinholeViews, frame: int, settings: HullSettings, given: Mapping[str, Path] | None = None
 ) -> None:
-    """Check that no more than `tolerance` cameras have an empty silhouette.
+    """Check that no more cameras have an empty silhouette than the settings bear.
+
+    These are `tolerance`; where what is outside a view may be unseen, all but half the cameras (two at least, four are
+    enough).
 
     Parameters
     ----------
     views : PinholeViews
     frame : int
         For messages.
-    tolerance : int
+    settings : HullSettings
     given : mapping of camera name to Path, optional
         The masks that the silhouettes were taken from, for messages.
 
@@ -59,15 +73,17 @@ def check_silhouettes(
     GeometryError
         If more are empty.
     """
-    empty = [n for n, m in zip(views.names, views.masks, strict=True) if not m.any()]
-    if len(empty) <= tolerance:
+    empty = [views.names[c] for c in np.flatnonzero(views.empty())]
+    left = len(views) - len(empty)
+    auto = settings.outside == "auto"
+    if len(empty) <= settings.tolerance or (auto and left >= max(2, min(ENOUGH, (len(views) + 1) // 2))):
         return
     cause = "its image and background"
     if given is not None:
         cause = f"{', '.join(str(given[n]) for n in empty)} (expected: 255 where the subject is)"
     remedy = "cut the recording to the frames that show it"
-    if len(views) - len(empty) >= 2:
-        remedy = f"set carving.hull.tolerance = {len(empty)}, name only the other cameras in capture.toml, or {remedy}"
+    if left >= 2 and not auto:
+        remedy = f"set carving.hull.outside = 'auto', name only the other cameras in capture.toml, or {remedy}"
     raise GeometryError(
         f"frame {frame}: the silhouette of camera {', '.join(empty)} is empty; check {cause}; where the subject is out "
         f"of sight, {remedy}"
@@ -85,6 +101,11 @@ def check_agreement(views: PinholeViews, frame: int, settings: HullSettings) -> 
     share = silhouette_coverage(views, settings)
     reached = float(np.median(share))
     if reached >= LOW_COVERAGE:
+        if not share.all():
+            raise GeometryError(
+                f"frame {frame}: camera {views.names[int(share.argmin())]} looks away: the volume that the others see is "
+                "nowhere in its silhouette; check its calibration, synchronization and silhouettes, or leave it out"
+            )
         return
     without = np.zeros(len(views))
     for c in range(len(views)) if len(views) > 2 else ():
@@ -176,13 +197,13 @@ def check_inside(surface: np.ndarray, grid: Grid, frame: int, max_cut: float = 0
         )
 
 
-def _share_view(views: PinholeViews) -> bool:
-    """Whether some point is seen by all cameras, looking on several scales round where their axes meet."""
+def _share_view(views: PinholeViews, settings: HullSettings = ALL) -> bool:
+    """Whether some point is seen by enough cameras, looking on several scales round where their axes meet."""
     everything = views.everything()
     center, reach = focus(everything)
     for scale in (0.1, 0.5, 1.0, 3.0, 10.0):
         grid = Grid.of_box(center - scale * reach, center + scale * reach, resolution=CELLS)
-        if hull(everything, grid).bits.any():
+        if hull(everything, grid, settings).bits.any():
             return True
     return False
 

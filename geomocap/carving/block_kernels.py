@@ -35,12 +35,13 @@ def summed(masks):
 def classify(P, size, subject, seen, unseen, c, x, y, z, dx, dy, dz):
     """Say what camera c says of all points within ±(dx, dy, dz) of (x, y, z), or MIXED if it can't be told.
 
+    `unseen` (C,) tells for which cameras what is outside their view is unseen; for the others it is background.
     For the point X0 in the middle, n(X) − u0 w(X) is linear and 0 at X0, so |u(X) − u0| is at most its largest value
     in the box over the smallest depth there. `size` (C, 2) bounds the sums in numerators and depth: rounding errors
     scale with it.
     """
     H, W = subject.shape[1] - 1, subject.shape[2] - 1
-    outside = UNSEEN if unseen else BACKGROUND
+    outside = UNSEEN if unseen[c] else BACKGROUND
     w = P[c, 2, 0] * x + P[c, 2, 1] * y + P[c, 2, 2] * z + P[c, 2, 3]
     reach = dx * abs(P[c, 2, 0]) + dy * abs(P[c, 2, 1]) + dz * abs(P[c, 2, 2])
     error = 1e-14 * size[c, 1]
@@ -80,7 +81,7 @@ def classify(P, size, subject, seen, unseen, c, x, y, z, dx, dy, dz):
         return SUBJECT
     if filled > 0:
         return MIXED
-    if not unseen:
+    if not unseen[c]:
         return BACKGROUND
     visible = seen[c, v1, u1] - seen[c, v0, u1] - seen[c, v1, u0] + seen[c, v0, u0]
     if visible == 0:
@@ -153,9 +154,9 @@ def _carve_block(
                 if n_background > tolerance:
                     break
         views = n_subject + n_background
-        if n_background > tolerance or (unseen and views + mixed < min_views):
+        if n_background > tolerance or views + mixed < min_views:
             continue
-        if n_background + mixed <= tolerance and (not unseen or views >= min_views):
+        if n_background + mixed <= tolerance and views >= min_views:
             word = np.uint32(((1 << (k1 - k0)) - 1) << (k0 & 31))
             for i in range(i0, i1):
                 for j in range(j0, j1):
@@ -190,18 +191,15 @@ def _carve_block(
                         if w > 0.0:
                             u = (P[c, 0, 0] * x + P[c, 0, 1] * y + P[c, 0, 2] * z + P[c, 0, 3]) / w
                             v = (P[c, 1, 0] * x + P[c, 1, 1] * y + P[c, 1, 2] * z + P[c, 1, 3]) / w
-                        if not (u >= 0.0 and v >= 0.0 and u < W and v < H):
-                            against += not unseen
-                        elif masks[c, int(v), int(u)]:
+                        on_canvas = u >= 0.0 and v >= 0.0 and u < W and v < H
+                        if on_canvas and masks[c, int(v), int(u)]:
                             views += 1
-                        elif not unseen:
-                            against += 1
-                        elif valid[c, int(v), int(u)]:
+                        elif not unseen[c] or (on_canvas and valid[c, int(v), int(u)]):
                             against += 1
                             views += 1
                         if against > tolerance:
                             break
-                    if against <= tolerance and (not unseen or views >= min_views):
+                    if against <= tolerance and views >= min_views:
                         bits[i, j, k >> 5] |= np.uint32(1 << (k & 31))
 
 
@@ -231,5 +229,5 @@ def possible(P, size, subject, seen, unseen, tolerance, min_views, origin, edge,
             against += answer == BACKGROUND
             if against > tolerance:
                 break
-        possible[n] = against <= tolerance and (not unseen or views >= min_views)
+        possible[n] = against <= tolerance and views >= min_views
     return possible

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from geomocap.carving.block_kernels import possible, summed
 from geomocap.carving.grid import Grid
-from geomocap.carving.hull import rounding_bounds
+from geomocap.carving.hull import heard, rounding_bounds
 from geomocap.carving.settings import HullSettings
 from geomocap.carving.views import PinholeViews
 from geomocap.errors import GeometryError
@@ -79,12 +79,13 @@ def subject_cells(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarr
 def halve(
     views: PinholeViews,
     settings: HullSettings,
-    tables: tuple[np.ndarray, np.ndarray],
+    tables: tuple[np.ndarray, np.ndarray, np.ndarray],
     cells: np.ndarray,
     origin: np.ndarray,
     edge: float,
 ) -> np.ndarray:
     """Divide cells of size `edge` into eight each and return those that may hold a point of the hull, (M, 3) int64."""
+    subject, seen, unseen = tables
     parts = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     children = (2 * cells[:, None] + parts).reshape(-1, 3)
     high = origin + (children.max(axis=0) + 1) * (edge / 2)
@@ -92,10 +93,11 @@ def halve(
     keep = possible(
         views.projections,
         rounding_bounds(views, space),
-        *tables,
-        settings.outside == "unseen",
+        subject,
+        seen,
+        unseen,
         settings.tolerance,
-        settings.min_views,
+        settings.min_views if unseen.any() else 0,
         origin,
         edge / 2,
         children,
@@ -103,9 +105,11 @@ def halve(
     return children[keep]
 
 
-def _tables(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.ndarray]:
+def _tables(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Integral images of the silhouettes and of what is seen, and for which cameras the outside is unseen."""
     subject = summed(views.masks)
-    return subject, summed(views.valid) if settings.outside == "unseen" else subject
+    unseen, valid = heard(views, settings)
+    return subject, summed(valid) if unseen.any() else subject, unseen
 
 
 def _connected(cells: np.ndarray) -> np.ndarray:

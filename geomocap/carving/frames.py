@@ -48,7 +48,7 @@ def carve_frame(
     GeometryError
         If a silhouette is empty, the silhouettes contradict each other, or the subject is outside the volume.
     """
-    check_silhouettes(views, frame, settings.hull.tolerance)
+    check_silhouettes(views, frame, settings.hull)
 
     # Shape from silhouette
     occupancy = hull(views, grid, settings.hull)

@@ -22,28 +22,28 @@ _DEFAULT = HullSettings()
 def hull(views: PinholeViews, grid: Grid, settings: HullSettings = _DEFAULT) -> Occupancy:
     """Carve the visual hull.
 
-    A voxel stays if at most `tolerance` cameras call it background and, with `outside = "unseen"`, at least `min_views`
-    cameras see it.
+    A voxel stays if at most `tolerance` cameras call it background and, where what is outside some view is unseen, at
+    least `min_views` cameras have a say.
 
     References
     ----------
     Szeliski, Rapid octree construction from image sequences, CVGIP: Image Understanding 58(1), 1993; the integral
     images are Crow's summed-area tables (SIGGRAPH 1984).
     """
-    unseen = settings.outside == "unseen"
+    unseen, valid = heard(views, settings)
     occupancy = Occupancy.empty(grid.shape)
     subject = summed(views.masks)
-    seen = summed(views.valid) if unseen else subject
+    seen = summed(valid) if unseen.any() else subject
     carve(
         views.projections,
         rounding_bounds(views, grid),
         views.masks,
-        views.valid,
+        valid,
         subject,
         seen,
         unseen,
         settings.tolerance,
-        settings.min_views,
+        settings.min_views if unseen.any() else 0,
         grid.origin,
         grid.voxel_size,
         grid.shape[2],
@@ -74,6 +74,23 @@ def hull_surface(views: PinholeViews, grid: Grid, settings: HullSettings = _DEFA
     A voxel is on the surface if one of its six neighbours is empty or beyond the grid.
     """
     return hull(views, grid, settings).surface_indices()
+
+
+def heard(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Tell of what each camera has a say.
+
+    Returns
+    -------
+    unseen : (C,) bool
+        What is outside the camera's view is unseen; for the others it is background.
+    valid : (C, H, W) uint8
+        1 where the camera sees anything: with `outside = "auto"` nothing where the silhouette is empty.
+    """
+    if settings.outside != "auto":
+        return np.full(len(views), settings.outside == "unseen"), views.valid
+    empty = views.empty()
+    valid = np.where(empty[:, None, None], np.uint8(0), views.valid) if empty.any() else views.valid
+    return views.cut_off() | empty, valid
 
 
 def rounding_bounds(views: PinholeViews, grid: Grid) -> np.ndarray:

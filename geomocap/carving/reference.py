@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit, prange
 
 from geomocap.carving.grid import Grid
+from geomocap.carving.hull import heard
 from geomocap.carving.settings import HullSettings
 from geomocap.carving.views import PinholeViews
 
@@ -19,7 +20,8 @@ def visual_hull_numpy(views: PinholeViews, grid: Grid, settings: HullSettings = 
     H, W = views.masks.shape[1:]
     background = np.zeros(grid.shape, np.int64)
     visible = np.zeros(grid.shape, np.int64)
-    for P, mask, valid in zip(views.projections, views.masks, views.valid, strict=True):
+    unseen, seen_at = heard(views, settings)
+    for P, mask, valid, is_open in zip(views.projections, views.masks, seen_at, unseen, strict=True):
         n0, n1, w = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in P)
         front = w > 0
         depth = np.where(front, w, 1.0)
@@ -28,10 +30,10 @@ def visual_hull_numpy(views: PinholeViews, grid: Grid, settings: HullSettings = 
         column, row = np.where(on_canvas, u, 0).astype(int), np.where(on_canvas, v, 0).astype(int)
         inside = on_canvas & (mask[row, column] != 0)
         seen = on_canvas & (valid[row, column] != 0)
-        background += (seen & ~inside) if settings.outside == "unseen" else ~inside
-        visible += seen
+        background += (seen & ~inside) if is_open else ~inside
+        visible += seen if is_open else 1
     stays = background <= settings.tolerance
-    if settings.outside == "unseen":
+    if unseen.any():
         stays &= visible >= settings.min_views
     return stays.astype(np.uint8)
 

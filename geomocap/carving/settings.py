@@ -14,12 +14,15 @@ Point = tuple[float, float, float]
 class HullSettings(Settings):
     """When a voxel belongs to the visual hull."""
 
-    outside: Literal["empty", "unseen"] = Field(
-        default="empty",
-        description="what a voxel outside a camera's view is for that camera: background, as in the paper, or unseen: "
-        "that camera has no say",
+    outside: Literal["auto", "empty", "unseen"] = Field(
+        default="auto",
+        description="what a voxel outside a camera's view is for that camera: empty: background, as in the paper; "
+        "unseen: that camera has no say; auto: unseen in the frames in which the camera's silhouette is cut off by the "
+        "image's border; a camera whose silhouette is empty has no say at all in that frame",
     )
-    min_views: int = Field(default=2, ge=1, description="cameras that must see a voxel if outside = 'unseen' (count)")
+    min_views: int = Field(
+        default=2, ge=1, description="cameras that must have a say of a voxel, where it may be unseen (count)"
+    )
     tolerance: int = Field(default=0, ge=0, description="cameras that may call a voxel background and it stays (count)")
 
 

@@ -12,6 +12,9 @@ from scipy.ndimage import label
 from geomocap.cameras import Rig
 from geomocap.errors import CalibrationError
 
+BORDER = 3  # a silhouette that comes as near as this to the border of the image reaches it (pixels)
+LEAST_CUT = 3  # if so many of its pixels do
+
 
 @dataclass(frozen=True)
 class PinholeViews:
@@ -68,6 +71,18 @@ class PinholeViews:
         inside = pad([(m != 0).view(np.uint8) for m in masks])
         inside &= seen
         return cls(tuple(names or (str(c) for c in range(len(masks)))), np.asarray(projections), inside, seen)
+
+    def cut_off(self) -> np.ndarray:
+        """Tell which cameras may see a part of the subject only, (C,) bool: it reaches the border of what they see."""
+        cut = np.zeros(len(self), bool)
+        for c, (mask, valid) in enumerate(zip(self.masks, self.valid, strict=True)):
+            rim = valid & (1 - cv2.erode(valid, None, iterations=BORDER, borderType=cv2.BORDER_CONSTANT, borderValue=0))
+            cut[c] = np.count_nonzero(mask & rim) >= LEAST_CUT
+        return cut
+
+    def empty(self) -> np.ndarray:
+        """Tell which cameras see nothing of the subject, (C,) bool."""
+        return ~self.masks.any(axis=(1, 2))
 
     def without(self, camera: int) -> PinholeViews:
         """Return the views of all other cameras."""

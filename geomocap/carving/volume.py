@@ -47,7 +47,7 @@ def working_volume(
     box: tuple[np.ndarray, np.ndarray] | None = None
     longest = 0.0
     for number, views in zip(count() if numbers is None else numbers, frames, strict=False):
-        check_silhouettes(views, number, settings.hull.tolerance)
+        check_silhouettes(views, number, settings.hull)
         found = subject_box(views, settings.hull)
         if box is None or found is None:
             check_agreement(views, number, settings.hull)

@@ -48,7 +48,7 @@ def carving_settings(job: Job, capture: Capture) -> CarvingSettings:
 def _carve_all(job: Job, capture: Capture, settings: CarvingSettings) -> int:
     undistortion = Undistortion.of(capture.rig)
     task = _Carve(capture, job.run, settings, undistortion, None)
-    check_cameras(task.views(0).everything())
+    check_cameras(task.views(0).everything(), settings.hull)
     count = min(VOLUME_FRAMES, capture.n_frames)
     sample = np.unique(np.linspace(0, capture.n_frames - 1, count).round().astype(int)).tolist()
     grid = working_volume(_reported(job, task, sample), settings, sample)
@@ -82,7 +82,7 @@ class _Carve:
         """Read the silhouettes of a frame; an empty one is reported with the mask it was taken from."""
         capture, views = self.capture, self.views(frame)
         given = {c: capture.mask_file(c, frame) for c in capture.cameras} if capture.has_masks else None
-        check_silhouettes(views, frame, self.settings.hull.tolerance, given)
+        check_silhouettes(views, frame, self.settings.hull, given)
         return views
 
     def __call__(self, frame: int) -> None:

@@ -55,7 +55,7 @@ def random_views(rng: np.random.Generator) -> PinholeViews:
 @settings(max_examples=150, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
-    outside=st.sampled_from(["empty", "unseen"]),
+    outside=st.sampled_from(["auto", "empty", "unseen"]),
     min_views=st.integers(1, 4),
     tolerance=st.integers(0, 2),
 )

@@ -133,14 +133,56 @@ def test_agreeing_silhouettes_are_explained():
 
 def test_a_camera_that_looks_away_is_named():
     P = ring(6)
-    check_cameras(figure(P))
+    hull = HullSettings(outside="empty")
+    check_cameras(figure(P), hull)
     center = -np.linalg.solve(P[2, :, :3], P[2, :, 3])
     P[2] = look_at(center, 2 * center, 300, 320, 240)
     with pytest.raises(CalibrationError, match="camera cam2 looks away"):
-        check_cameras(PinholeViews.of(P, [np.ones((240, 320))] * 6, names=[f"cam{c}" for c in range(6)]))
+        check_cameras(PinholeViews.of(P, [np.ones((240, 320))] * 6, names=[f"cam{c}" for c in range(6)]), hull)
     P[4] = look_at(center, 2 * center, 300, 320, 240)
     with pytest.raises(CalibrationError, match="no point is seen by all cameras"):
-        check_cameras(PinholeViews.of(P, [np.ones((240, 320))] * 6))
+        check_cameras(PinholeViews.of(P, [np.ones((240, 320))] * 6), hull)
+
+
+def test_cameras_that_all_look_elsewhere_are_reported():
+    P = ring(3)
+    centers = [-np.linalg.solve(p[:, :3], p[:, 3]) for p in P]
+    everywhere = [np.ones((240, 320))] * 3
+    check_cameras(PinholeViews.of(P, everywhere), HullSettings())
+    away = np.array([look_at(c, 2 * c, 300, 320, 240) for c in centers])
+    with pytest.raises(CalibrationError, match="no point is seen by 2 of the cameras 0, 1, 2"):
+        check_cameras(PinholeViews.of(away, everywhere), HullSettings())
+
+
+def test_a_camera_turned_away_is_named_by_its_silhouette():
+    P = ring(6)
+    masks = silhouettes(P, FIGURE)
+    masks[2][:, 300:] |= masks[2][:, 140:160]  # what it sees is cut off by the border: it may not see all
+    center = -np.linalg.solve(P[2, :, :3], P[2, :, 3])
+    P[2] = look_at(center, 2 * center, 300, 320, 240)
+    with pytest.raises(GeometryError, match="frame 0: camera 2 looks away"):
+        working_volume([PinholeViews.of(P, masks)])
+
+
+def test_cameras_that_cut_the_subject_off_dont_cut_its_volume():
+    """Three of eight cameras see a part only, one nothing: the volume is that of the other cameras, less what they see."""
+    P = ring(8)
+    whole = silhouettes(P, FIGURE)
+    masks = [m[:130] if c == 1 else m[110:] if c == 4 else m[:, :165] if c == 6 else m for c, m in enumerate(whole)]
+    lowered = P.copy()
+    lowered[4, 1] -= 110 * P[4, 2]
+    masks[3] = np.zeros_like(masks[3])
+    views = PinholeViews.of(lowered, masks)
+    assert views.cut_off().nonzero()[0].tolist() == [1, 4, 6] and views.empty().nonzero()[0].tolist() == [3]
+    grid = Grid.of_box(LOW - 0.2, HIGH + 0.2, resolution=96)
+    cut, complete = visual_hull(views, grid), visual_hull(PinholeViews.of(P, whole), grid)
+    rest = visual_hull(PinholeViews.of(P, whole).without(6).without(4).without(3).without(1), grid)
+    assert (complete <= cut).all() and (cut <= rest).all() and complete.sum() < cut.sum() < rest.sum()
+    low, high = subject_box(views, HullSettings())
+    assert (low <= LOW + 0.02).all() and (high >= HIGH - 0.02).all()
+    assert (high - low < 1.2 * (HIGH - LOW)).all()
+    with pytest.raises(GeometryError, match="camera 3 is empty"):
+        working_volume([views], CarvingSettings(hull=HullSettings(outside="empty")))
 
 
 def test_empty_silhouettes_are_named():
@@ -148,26 +190,29 @@ def test_empty_silhouettes_are_named():
     masks = silhouettes(P, FIGURE)
     masks[1][:] = 0
     views = PinholeViews.of(P, masks, names=["a", "b", "c", "d"])
+    strict = HullSettings(outside="empty")
     with pytest.raises(GeometryError, match="frame 12: the silhouette of camera b is empty"):
-        check_silhouettes(views, 12)
-    check_silhouettes(views, 12, tolerance=1)
+        check_silhouettes(views, 12, strict)
+    check_silhouettes(views, 12, HullSettings(outside="empty", tolerance=1))
+    check_silhouettes(views, 12, HullSettings())
     with pytest.raises(GeometryError, match="frame 3: the silhouette of camera b is empty"):
-        carve_frame(views, Grid.of_box(LOW, HIGH, resolution=32), frame=3)
+        carve_frame(views, Grid.of_box(LOW, HIGH, resolution=32), CarvingSettings(hull=strict), frame=3)
 
 
 def test_an_empty_silhouette_comes_with_advice_that_can_be_followed():
     views = figure(ring(4))
     views.masks[1] = 0
-    with pytest.raises(GeometryError, match=r"check its image and background; .* set carving\.hull\.tolerance = 1"):
-        check_silhouettes(views, 3)
+    strict = HullSettings(outside="empty")
+    with pytest.raises(GeometryError, match=r"check its image and background; .* set carving\.hull\.outside = 'auto'"):
+        check_silhouettes(views, 3, strict)
     given = {n: Path(f"masks/{n}/000003.png") for n in views.names}
     with pytest.raises(GeometryError, match=rf"check masks/{views.names[1]}/000003\.png \(expected: 255"):
-        check_silhouettes(views, 3, given=given)
-    allowed = CarvingSettings(hull=HullSettings(tolerance=1), resolution=32)
+        check_silhouettes(views, 3, strict, given)
+    allowed = CarvingSettings(resolution=32)
     assert len(carve_frame(views, working_volume([views], allowed), allowed, frame=3).indices) > 100
     views.masks[:3] = 0
     with pytest.raises(GeometryError, match="out of sight, cut the recording to the frames that show it"):
-        check_silhouettes(views, 3)
+        check_silhouettes(views, 3, HullSettings())
 
 
 def test_views_from_one_side_only_bound_nothing():
