@@ -1,6 +1,6 @@
 """A capture: the folder of synchronized images or videos that everything starts from, read lazily.
 
-capture.toml                     name, fps, length_unit, up; optional: cameras, template_camera, region_of_interest
+capture.toml                     name, fps, length_unit, up; optional: cameras, frames, template_camera, region_of_interest
 images/<camera>/000000.png       or videos/<camera>.mp4
 background/<camera>.png          optional
 masks/<camera>/000000.png        optional, used as they are
@@ -44,6 +44,9 @@ class CaptureInfo(Settings):
     length_unit: Literal["m"] = Field("m", description="unit of the calibration")
     up: Literal["y", "z"] = Field("z", description="world axis that points up")
     cameras: tuple[str, ...] | None = Field(None, description="the cameras to use, in this order; all if not given")
+    frames: tuple[int, int] | None = Field(
+        None, description="the first and the last frame to use, of what was recorded; all if not given"
+    )
     template_camera: str | None = Field(None, description="camera whose images are the templates of matching")
     region_of_interest: tuple[Point, Point] | None = Field(
         None, description="corners (min, max) of the working volume, metres, world"
@@ -56,6 +59,13 @@ class CaptureInfo(Settings):
             if names and name in names[:k]:
                 raise ValueError(f"camera {name} is there more than once; name each camera once")
         return names
+
+    @field_validator("frames")
+    @classmethod
+    def _in_order(cls, frames: tuple[int, int] | None) -> tuple[int, int] | None:
+        if frames is not None and not 0 <= frames[0] <= frames[1]:
+            raise ValueError(f"expected the first and the last frame to use, got {list(frames)}")
+        return frames
 
     @field_validator("region_of_interest")
     @classmethod
@@ -169,6 +179,8 @@ class Video:
 class Capture:
     """A capture folder, checked when it is opened; images are read when they are asked for.
 
+    Frames are numbered from the first that `capture.toml` says to use.
+
     Attributes
     ----------
     path : Path
@@ -176,6 +188,7 @@ class Capture:
     cameras : tuple of str
         Camera names in the order used everywhere.
     sources : dict of str to FrameSource
+        All that was recorded, also what isn't used.
     """
 
     path: Path
@@ -218,6 +231,12 @@ class Capture:
             raise CaptureError(
                 f"{path}: cameras have unequal numbers of frames ({listed}); cut them to the same frames"
             )
+        recorded = counts[names[0]]
+        if info.frames is not None and info.frames[1] >= recorded:
+            raise CaptureError(
+                f"{path / 'capture.toml'}: frames: {list(info.frames)}, but {recorded} were recorded; the last is "
+                f"{recorded - 1}"
+            )
         return cls(path, info, names, {n: found[n] for n in names})
 
     @property
@@ -227,12 +246,23 @@ class Capture:
 
     @property
     def n_frames(self) -> int:
-        """Number of frames, the same for all cameras."""
+        """Number of frames to use, the same for all cameras."""
+        first, last = self.info.frames or (0, self.n_recorded - 1)
+        return last - first + 1
+
+    @property
+    def n_recorded(self) -> int:
+        """Number of frames that were recorded, the same for all cameras."""
         return len(self.sources[self.cameras[0]])
+
+    @property
+    def first(self) -> int:
+        """Number of the first frame to use in the recording."""
+        return self.info.frames[0] if self.info.frames else 0
 
     def frame(self, camera: str, frame: int) -> np.ndarray:
         """Read one image: (H, W, 3) uint8, RGB."""
-        return self.sources[camera].read(frame)
+        return self.sources[camera].read(self.first + frame)
 
     def has_background(self, camera: str) -> bool:
         """Whether the capture brings an empty background picture of this camera."""
@@ -264,7 +294,7 @@ class Capture:
 
     def mask_file(self, camera: str, frame: int) -> Path:
         """Return where a given silhouette is, if the capture brings its own."""
-        return self.path / "masks" / camera / f"{frame:06d}.png"
+        return self.path / "masks" / camera / f"{self.first + frame:06d}.png"
 
     def mask(self, camera: str, frame: int) -> np.ndarray:
         """Read a given silhouette: (H, W) uint8, 0 or 255.

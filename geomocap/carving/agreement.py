@@ -81,7 +81,7 @@ def check_silhouettes(
     cause = "its image and background"
     if given is not None:
         cause = f"{', '.join(str(given[n]) for n in empty)} (expected: 255 where the subject is)"
-    remedy = "cut the recording to the frames that show it"
+    remedy = "name the frames that show it in capture.toml (frames = [first, last])"
     if left >= 2 and not auto:
         remedy = f"set carving.hull.outside = 'auto', name only the other cameras in capture.toml, or {remedy}"
     raise GeometryError(

@@ -29,7 +29,8 @@ def describe_capture(path: Path) -> Description:
     kinds = {"images" if isinstance(s, ImageFolder) else "video" for s in capture.sources.values()}
     told.fact("cameras", f"{len(capture.cameras)}: {shortened(list(capture.cameras))} ({' and '.join(sorted(kinds))})")
     seconds = capture.n_frames / info.fps
-    told.fact("frames", f"{capture.n_frames} at {info.fps:g} per second, {seconds:.2f} s")
+    part = f" ({info.frames[0]} to {info.frames[1]} of {capture.n_recorded})" if info.frames else ""
+    told.fact("frames", f"{capture.n_frames}{part} at {info.fps:g} per second, {seconds:.2f} s")
     told.fact("up", info.up)
     sizes: dict[str, list[str]] = {}
     for camera, source in capture.sources.items():
@@ -71,8 +72,8 @@ def _judge_parts(capture: Capture, plates: list[str], told: Description) -> None
 
 def _judge_masks(capture: Capture, camera: str, told: Description) -> None:
     there = len(list((capture.path / "masks" / camera).glob("*.png")))
-    if there != capture.n_frames:
-        told.problem(f"masks/{camera} has {there} silhouettes for {capture.n_frames} frames")
+    if there != capture.n_recorded:
+        told.problem(f"masks/{camera} has {there} silhouettes for {capture.n_recorded} frames")
         return
     files = [capture.mask_file(camera, k) for k in range(capture.n_frames)]
     if _judge_files(files, partial(capture.check_mask_size, camera), told):

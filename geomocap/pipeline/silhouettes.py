@@ -68,9 +68,10 @@ class _Learn:
     settings: SilhouetteSettings
 
     def __call__(self, camera: str) -> BackgroundModel:
-        count = min(self.settings.samples, self.capture.n_frames)
-        chosen = np.unique(np.linspace(0, self.capture.n_frames - 1, count).round().astype(int))
-        frames = [self.capture.frame(camera, int(k)) for k in chosen]
+        recorded = self.capture.sources[camera]  # also the frames before the subject came in
+        count = min(self.settings.samples, len(recorded))
+        chosen = np.unique(np.linspace(0, len(recorded) - 1, count).round().astype(int))
+        frames = [recorded.read(int(k)) for k in chosen]
         if self.capture.has_background(camera):
             return model_from_plate(self.capture.background(camera), frames, self.settings, camera)
         return model_from_frames(frames, self.settings, camera)

@@ -57,6 +57,26 @@ def test_images_are_read_as_they_were_written(tmp_path):
     assert not capture.has_masks and not capture.has_background("cam0")
 
 
+def test_part_of_a_recording(tmp_path):
+    """Frames and masks count from the first that is used; what came before is still there to learn from."""
+    make_capture(tmp_path)
+    write_capture_info(tmp_path, CaptureInfo(fps=25.0, frames=(1, 2)))
+    for k in range(4):
+        file = tmp_path / "masks" / "cam1" / f"{k:06d}.png"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        mask = np.zeros((240, 320), np.uint8)
+        mask[:, : k + 1] = 255
+        cv2.imwrite(str(file), mask)
+    capture = Capture.open(tmp_path)
+    assert (capture.n_frames, capture.n_recorded) == (2, 4)
+    np.testing.assert_array_equal(capture.frame("cam1", 1), picture(1, 2))
+    np.testing.assert_array_equal(capture.sources["cam1"].read(0), picture(1, 0))
+    assert np.count_nonzero(capture.mask("cam1", 0)[0]) == 2
+    with pytest.raises(CaptureError, match=r"cam1/000002\.png"):
+        (tmp_path / "masks" / "cam1" / "000002.png").unlink()
+        capture.mask("cam1", 1)
+
+
 def test_videos_are_read_in_any_order(tmp_path):
     write_video(tmp_path / "videos" / "cam0.mp4")
     write_capture_info(tmp_path, CaptureInfo(fps=25.0))
@@ -167,6 +187,8 @@ def test_a_turned_photograph_has_the_size_as_it_is_read(tmp_path):
         ("fps = 30\nup = 'x'", "up: Input should be 'y' or 'z'"),
         ("fps = 30\ncameras = ['cam1', 'cam1']", "cameras: camera cam1 is there more than once"),
         ("fps = 30\nregion_of_interest = [[0, 1, 0], [1, 0, 1]]", "region_of_interest: expected the corners"),
+        ("fps = 30\nframes = [2, 1]", r"frames: expected the first and the last frame to use, got \[2, 1\]"),
+        ("fps = 30\nframes = [1, 4]", r"frames: \[1, 4\], but 4 were recorded; the last is 3"),
         ("fps = 30\ntemplate_camera = 'nix'", "template_camera: there is no camera nix; choose one of cam0, cam1"),
         ("fps = 30\ncameras = ['cam0']\ntemplate_camera = 'cam1'", "template_camera: there is no camera cam1"),
     ],

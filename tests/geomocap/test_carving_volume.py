@@ -211,7 +211,7 @@ def test_an_empty_silhouette_comes_with_advice_that_can_be_followed():
     allowed = CarvingSettings(resolution=32)
     assert len(carve_frame(views, working_volume([views], allowed), allowed, frame=3).indices) > 100
     views.masks[:3] = 0
-    with pytest.raises(GeometryError, match="out of sight, cut the recording to the frames that show it"):
+    with pytest.raises(GeometryError, match=r"out of sight, name the frames that show it in capture\.toml"):
         check_silhouettes(views, 3, HullSettings())
 
 
