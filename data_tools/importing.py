@@ -16,10 +16,12 @@ from data_tools.image_sizes import SizeMismatch, find_fit, refit_camera
 from data_tools.plates import compose_plate
 from data_tools.synthesize import write_png
 from geomocap.cameras import Rig
-from geomocap.capture import IMAGE_ENDINGS, VIDEO_ENDINGS, Capture, CaptureInfo, Video, read_image, write_capture_info
+from geomocap.capture import Capture, CaptureInfo, write_capture_info
 from geomocap.errors import CalibrationError, CaptureError, GeomocapError
 from geomocap.files import write_atomic
+from geomocap.image_files import IMAGE_ENDINGS, read_image
 from geomocap.progress import Progress, silent
+from geomocap.video_files import VIDEO_ENDINGS, Video
 
 PLATE_FRAMES = 25  # frames of a video that a plate is composed from
 

@@ -19,8 +19,10 @@ from data_tools.calibration_files import (
     write_pose2sim,
 )
 from geomocap.cameras import Rig
-from geomocap.capture import IMAGE_ENDINGS, VIDEO_ENDINGS, CaptureInfo, Video, write_capture_info
+from geomocap.capture import CaptureInfo, write_capture_info
 from geomocap.errors import CalibrationError
+from geomocap.image_files import IMAGE_ENDINGS
+from geomocap.video_files import VIDEO_ENDINGS, Video
 
 Format = Literal["aniposelib", "caliscope", "pose2sim", "opencv", "easymocap", "colmap"]
 

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import open3d as o3d
 
-from geomocap.capture import Capture, read_image
+from geomocap.capture import Capture
 from geomocap.errors import GeometryError, RunError
 from geomocap.geometry import Voxels
+from geomocap.image_files import read_image
 from geomocap.open3d_files import read_by_open3d
 from geomocap.run import Run
 

@@ -17,8 +17,9 @@ from geomocap.calibration.settings import BarSettings
 from geomocap.calibration.targets import find_targets, gray_of
 from geomocap.calibration.world import World
 from geomocap.cameras import Rig
-from geomocap.capture import IMAGE_ENDINGS, check_links, read_capture_info, read_image
+from geomocap.capture import check_links, read_capture_info
 from geomocap.errors import CalibrationError, CaptureError
+from geomocap.image_files import IMAGE_ENDINGS, read_image
 from geomocap.progress import Progress, silent
 from geomocap.settings import Settings
 

@@ -13,11 +13,13 @@ from pydantic import Field, ValidationError
 from geomocap.calibration.settings import TargetSettings
 from geomocap.calibration.sightings import Sightings, stack_candidates
 from geomocap.calibration.targets import find_targets, gray_of, still_background
-from geomocap.capture import IMAGE_ENDINGS, VIDEO_ENDINGS, FrameSource, ImageFolder, Video
+from geomocap.capture import FrameSource
 from geomocap.errors import CaptureError
+from geomocap.image_files import IMAGE_ENDINGS, ImageFolder
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads
 from geomocap.settings import Settings
+from geomocap.video_files import VIDEO_ENDINGS, Video
 
 
 class BarInfo(Settings):

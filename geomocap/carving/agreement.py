@@ -103,8 +103,8 @@ def check_agreement(views: PinholeViews, frame: int, settings: HullSettings) -> 
     if reached >= LOW_COVERAGE:
         if not share.all():
             raise GeometryError(
-                f"frame {frame}: camera {views.names[int(share.argmin())]} looks away: the volume that the others see is "
-                "nowhere in its silhouette; check its calibration, synchronization and silhouettes, or leave it out"
+                f"frame {frame}: camera {views.names[int(share.argmin())]} looks away: the volume that the others see "
+                "is nowhere in its silhouette; check its calibration, synchronization and silhouettes, or leave it out"
             )
         return
     without = np.zeros(len(views))

@@ -9,7 +9,7 @@ from numba import njit
 from geomocap.cameras import Rig
 from geomocap.carving.bounds import subject_box
 from geomocap.carving.grid import Grid
-from geomocap.carving.hull import hull
+from geomocap.carving.hull import heard, hull
 from geomocap.carving.settings import HullSettings
 from geomocap.carving.views import PinholeViews
 
@@ -44,7 +44,7 @@ def fill_false_holes(rig: Rig, views: PinholeViews, masks: list[np.ndarray]) -> 
     """
     result = list(masks)
     holes = [enclosed_holes(mask) for mask in masks]
-    if len(views) <= LEAST_OTHERS or not any(holes):
+    if np.count_nonzero(~views.empty()) <= LEAST_OTHERS or not any(holes):
         return result
     box = subject_box(views, ALL_BUT_ONE)
     if box is None:
@@ -52,7 +52,8 @@ def fill_false_holes(rig: Rig, views: PinholeViews, masks: list[np.ndarray]) -> 
     grid = Grid.of_box(*box, resolution=RESOLUTION)
     occupied = hull(views, grid, ALL_BUT_ONE).indices()
     dissent = np.full(grid.shape, EMPTY, np.int8)
-    _find_dissent(views.projections, views.masks, occupied, grid.origin, grid.voxel_size, dissent)
+    unseen, valid = heard(views, ALL_BUT_ONE)
+    _find_dissent(views.projections, views.masks, valid, unseen, occupied, grid.origin, grid.voxel_size, dissent)
     for c, mask in enumerate(masks):
         filled = mask.copy()
         for inside, rim in holes[c]:
@@ -111,7 +112,7 @@ def _thickness(rig: Rig, camera: int, pixels: np.ndarray, dissent: np.ndarray, g
 
 
 @njit(cache=True, nogil=True)
-def _find_dissent(P, masks, occupied, origin, edge, dissent):
+def _find_dissent(P, masks, valid, unseen, occupied, origin, edge, dissent):
     """Write into each voxel of the hull which camera calls it background; NOBODY if none does."""
     C, H, W = masks.shape
     for n in range(len(occupied)):
@@ -122,7 +123,10 @@ def _find_dissent(P, masks, occupied, origin, edge, dissent):
             w = P[c, 2, 0] * x + P[c, 2, 1] * y + P[c, 2, 2] * z + P[c, 2, 3]
             u = (P[c, 0, 0] * x + P[c, 0, 1] * y + P[c, 0, 2] * z + P[c, 0, 3]) / w
             v = (P[c, 1, 0] * x + P[c, 1, 1] * y + P[c, 1, 2] * z + P[c, 1, 3]) / w
-            if not (w > 0 and 0 <= u < W and 0 <= v < H) or masks[c, int(v), int(u)] == 0:
+            in_view = w > 0 and 0 <= u < W and 0 <= v < H
+            if in_view and masks[c, int(v), int(u)]:
+                continue
+            if not unseen[c] or (in_view and valid[c, int(v), int(u)]):
                 dissent[i, j, k] = c
 
 

@@ -75,14 +75,15 @@ class PinholeViews:
     def cut_off(self) -> np.ndarray:
         """Tell which cameras may see a part of the subject only, (C,) bool: it reaches the border of what they see."""
         cut = np.zeros(len(self), bool)
+        window = np.ones((2 * BORDER + 1,) * 2, np.uint8)
         for c, (mask, valid) in enumerate(zip(self.masks, self.valid, strict=True)):
-            rim = valid & (1 - cv2.erode(valid, None, iterations=BORDER, borderType=cv2.BORDER_CONSTANT, borderValue=0))
-            cut[c] = np.count_nonzero(mask & rim) >= LEAST_CUT
+            within = cv2.erode(valid, window, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+            cut[c] = np.count_nonzero(mask & (valid ^ within)) >= LEAST_CUT
         return cut
 
     def empty(self) -> np.ndarray:
         """Tell which cameras see nothing of the subject, (C,) bool."""
-        return ~self.masks.any(axis=(1, 2))
+        return np.array([not mask.any() for mask in self.masks])
 
     def without(self, camera: int) -> PinholeViews:
         """Return the views of all other cameras."""

@@ -11,11 +11,12 @@ from typing import Literal
 import numba
 import open3d as o3d
 
-from geomocap.capture import Capture, read_image
+from geomocap.capture import Capture
 from geomocap.cloud import CloudFrame, CloudSettings, MatchGroups, cloud_of_frame, match_groups
 from geomocap.errors import CaptureError, GeometryError, RunError
 from geomocap.files import write_atomic, write_text
 from geomocap.geometry import Voxels
+from geomocap.image_files import read_image
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.silhouettes import silhouettes
 from geomocap.pipeline.voxels import voxels

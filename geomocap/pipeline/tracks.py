@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geomocap.capture import Capture, read_image
+from geomocap.capture import Capture
 from geomocap.carving.views import Undistortion
 from geomocap.errors import CaptureError
 from geomocap.geometry import Voxels, read_cloud
+from geomocap.image_files import read_image
 from geomocap.pipeline.clouds import HULL_CAMERAS, clouds
 from geomocap.pipeline.derived import KEYPOINT_FILES
 from geomocap.pipeline.job import Job

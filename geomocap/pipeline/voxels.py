@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomocap.capture import Capture, read_image
+from geomocap.capture import Capture
 from geomocap.carving.agreement import check_cameras, check_silhouettes
 from geomocap.carving.frames import carve_frame, needs_images
 from geomocap.carving.grid import Grid
@@ -15,6 +15,7 @@ from geomocap.carving.settings import CarvingSettings
 from geomocap.carving.views import PinholeViews, Undistortion
 from geomocap.carving.volume import working_volume
 from geomocap.errors import CaptureError
+from geomocap.image_files import read_image
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.silhouettes import silhouettes
 from geomocap.run import Run, stage_key

@@ -16,12 +16,12 @@ from scipy.spatial import cKDTree
 from data_tools.gltf import load_gltf
 from data_tools.synthesize import SynthesisSettings, synthesize
 from geomocap.cameras import Rig
-from geomocap.capture import read_image
 from geomocap.carving.frames import carve_frame
 from geomocap.carving.settings import CarvingSettings
 from geomocap.carving.views import Undistortion
 from geomocap.carving.volume import working_volume
 from geomocap.cloud import CloudFrame, cloud_of_frame, match_groups
+from geomocap.image_files import read_image
 from geomocap.matching.lsm import match_pairs
 from geomocap.matching.settings import KernelSettings
 from geomocap.matching.spline import SplineImage

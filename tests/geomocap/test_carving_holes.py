@@ -65,6 +65,20 @@ def test_false_hole_is_filled_and_a_real_gap_kept(torso_and_ring):
     assert any(enclosed_holes(m) for m in masks), "no camera sees through the ring: the test shows nothing"
 
 
+def test_cameras_that_see_nothing_or_a_part_bear_no_witness(torso_and_ring):
+    """An empty silhouette, and one of an image that ends in the middle of the subject, contradict nothing."""
+    rig, masks = torso_and_ring
+    damaged = [m.copy() for m in masks]
+    damaged[3][:] = 0
+    u, v = rig.project(np.array([[-0.3, 0.0, 0.0]]))[1, 0]
+    cv2.circle(damaged[1], (int(u), int(v)), 5, 0, -1)
+    views = undistort_masks(rig, damaged)
+    views.valid[4, : SIZE // 2] = 0
+    views.masks[4, : SIZE // 2] = 0
+    repaired = fill_false_holes(rig, views, damaged)
+    np.testing.assert_array_equal(repaired[1], masks[1])
+
+
 def test_too_few_cameras_fill_nothing(torso_and_ring):
     rig, masks = torso_and_ring
     some = rig.select(rig.names[:3])

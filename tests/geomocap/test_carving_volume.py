@@ -165,7 +165,7 @@ def test_a_camera_turned_away_is_named_by_its_silhouette():
 
 
 def test_cameras_that_cut_the_subject_off_dont_cut_its_volume():
-    """Three of eight cameras see a part only, one nothing: the volume is that of the other cameras, less what they see."""
+    """Three of eight cameras see a part only, one nothing: the volume is what the others see, less what those say."""
     P = ring(8)
     whole = silhouettes(P, FIGURE)
     masks = [m[:130] if c == 1 else m[110:] if c == 4 else m[:, :165] if c == 6 else m for c, m in enumerate(whole)]

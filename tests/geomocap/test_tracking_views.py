@@ -42,6 +42,14 @@ def test_points_outside_a_silhouette_are_not_the_subject(views):
     assert views[0].may_be_subject(points).tolist() == [True, True, False, True]  # the last one nobody sees
 
 
+def test_an_empty_silhouette_allows_all_points(scene):
+    """A camera that doesn't see the subject, or lost a frame, says of no point that it isn't the subject's."""
+    images, masks = scene.images(0)
+    masks[0][:] = 0
+    view = FrameViews.of(PinholeViews.of(scene.projections(), masks), images, scene.voxels(0))
+    assert view.may_be_subject(np.array([[0.0, 0, 0], [0.3, 0, 0]])).tolist() == [True, False]
+
+
 def test_frame_views_refuse_images_of_another_size(scene):
     images, masks = scene.images(0)
     views = PinholeViews.of(scene.projections(), masks)

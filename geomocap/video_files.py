@@ -1,0 +1,99 @@
+"""Frames of a video file, read when they are asked for."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import av
+import numpy as np
+
+from geomocap.errors import CaptureError
+
+VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+
+
+@dataclass
+class Video:
+    """Frames of one camera in a video file, decoded one by one and never unpacked to disk.
+
+    Reading forwards is cheap; reading elsewhere seeks to the key frame before. May be shared by threads.
+    """
+
+    path: Path
+    kept: int = 8
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+    _container: av.container.InputContainer | None = field(default=None, repr=False)
+    _frames: object = field(default=None, repr=False)
+    _next: int = field(default=0, repr=False)
+    _recent: OrderedDict[int, np.ndarray] = field(default_factory=OrderedDict, repr=False)
+
+    def __getstate__(self) -> dict:
+        return {"path": self.path, "kept": self.kept}
+
+    def __setstate__(self, state: dict) -> None:
+        self.__init__(**state)  # type: ignore[misc]
+
+    @cached_property
+    def _times(self) -> tuple[int, ...]:
+        """Presentation times of all frames, from the packets alone (nothing is decoded)."""
+        try:
+            with av.open(str(self.path)) as container:
+                stream = container.streams.video[0]
+                times = sorted(p.pts for p in container.demux(stream) if p.pts is not None and not p.is_discard)
+        except (av.FFmpegError, IndexError, OSError) as error:
+            raise CaptureError(f"{self.path}: no readable video ({error}); record or copy it again") from None
+        if not times:
+            raise CaptureError(f"{self.path}: holds no video frames; record or copy it again")
+        return tuple(times)
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    @cached_property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the frames, pixels."""
+        height, width = self.read(0).shape[:2]
+        return width, height
+
+    def read(self, frame: int) -> np.ndarray:
+        """Return frame `frame` as (H, W, 3) uint8, RGB."""
+        with self._lock:
+            if frame not in self._recent:
+                try:
+                    self._decode_to(frame)
+                except (av.FFmpegError, StopIteration) as error:
+                    reason = str(error) or "it ends early"
+                    raise CaptureError(
+                        f"{self.path}: frame {frame} of {len(self)} can't be decoded ({reason}); copy the file again"
+                    ) from None
+            return self._recent[frame]
+
+    def _decode_to(self, frame: int) -> None:
+        times = self._times
+        if self._container is None or not self._next <= frame <= self._next + 64:
+            if self._container is not None:
+                self._container.close()
+            self._container = av.open(str(self.path))
+            stream = self._container.streams.video[0]
+            stream.thread_type = "SLICE"  # frame threads would hand out frames late after a seek
+            if frame > 0:
+                self._container.seek(times[frame], stream=stream, backward=True)
+            self._frames = self._container.decode(stream)
+        while True:
+            picture = next(self._frames)  # type: ignore[call-overload]
+            if picture.pts is None or picture.is_corrupt:
+                raise CaptureError(f"{self.path}: damaged near frame {frame} of {len(self)}; copy the file again")
+            index = int(np.searchsorted(times, picture.pts))
+            self._next = index + 1
+            if index >= frame - self.kept // 2:
+                self._recent[index] = picture.to_ndarray(format="rgb24")
+                while len(self._recent) > self.kept:
+                    self._recent.popitem(last=False)
+            if index >= frame:
+                if index > frame:
+                    raise CaptureError(f"{self.path}: frame {frame} is missing from the stream; copy the file again")
+                return
