@@ -9,12 +9,31 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
+import cv2
 import numba
 
 from geomocap.progress import Progress, silent
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+
+_limit: int | None = None
+
+
+def limit_threads(count: int | None) -> None:
+    """Limit the threads of this process, of all executors and parallel kernels made from now on.
+
+    Parameters
+    ----------
+    count : int or None
+        None: as many as there are cores.
+    """
+    global _limit
+    _limit = count
+    most = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+    numba.set_num_threads(min(count or most, most))
+    cv2.setNumThreads(-1 if count is None else count)
 
 
 @contextmanager
@@ -24,9 +43,9 @@ def threads(workers: int | None = None) -> Iterator[ThreadPoolExecutor]:
     Parameters
     ----------
     workers : int, optional
-        Number of threads; the number of cores if not given.
+        Number of threads; if not given the limit that was set, else the number of cores.
     """
-    count = workers or os.cpu_count() or 1
+    count = workers or _limit or os.cpu_count() or 1
     kernel_threads = max(1, numba.get_num_threads() // count)
     with ThreadPoolExecutor(count, initializer=numba.set_num_threads, initargs=(kernel_threads,)) as executor:
         yield executor

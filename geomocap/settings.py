@@ -89,17 +89,20 @@ def load_settings(model: type[Model], path: Path | None = None, overrides: dict[
     SettingsError
         If the file can't be read, a key is unknown or a value out of range.
     """
-    values: dict[str, Any] = {}
-    if path is not None:
-        try:
-            values = tomllib.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise SettingsError(f"{path}: can't be read ({error.strerror})") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise SettingsError(f"{path}: not valid TOML ({error})") from None
-        if "config" in values and "geomocap" in values:  # a run.toml
-            values = values["config"]
+    values = {} if path is None else read_settings(path)
+    if "config" in values and "geomocap" in values:  # a run.toml
+        values = values["config"]
     return check_settings(model, _merge(values, overrides or {}), str(path) if path is not None else "")
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """Read a settings file as it is; raises SettingsError if it isn't TOML or can't be read."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SettingsError(f"{path}: can't be read ({error.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: not valid TOML ({error})") from None
 
 
 def _merge(values: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:

@@ -219,7 +219,10 @@ def warnings(results: Results, quality: Quality) -> list[str]:
         ):
             empty = int((share < 1e-4).sum())
             if empty:
-                said.append(f"{camera}: the silhouette is empty in {empty} of {len(share)} frames looked at.")
+                said.append(
+                    f"{camera}: the silhouette is empty in {empty} of {len(share)} frames looked at; "
+                    "this camera has no say there."
+                )
             elif np.nanmax(share) > 0.5:
                 said.append(
                     f"{camera}: a silhouette covers {100 * np.nanmax(share):.0f} % of the image; is it background?"
@@ -234,7 +237,7 @@ def warnings(results: Results, quality: Quality) -> list[str]:
             if cut.any():
                 said.append(
                     f"{camera}: the silhouette reaches the image's border in {int(cut.sum())} of {len(cut)} frames; "
-                    "what is out of sight there can't be carved by this camera."
+                    "what is out of its sight there is left to the other cameras."
                 )
     for camera, (covered, inside) in quality.agreement.items():
         if covered < 0.9:

@@ -32,10 +32,9 @@ def check_cameras(views: PinholeViews, settings: HullSettings) -> None:
     if len(views) < 2:
         return
     if settings.outside != "empty":
-        if not _share_view(views, HullSettings(outside="unseen", min_views=settings.min_views)):
-            raise CalibrationError(
-                f"no point is seen by {settings.min_views} of the cameras {', '.join(views.names)}; check their poses"
-            )
+        least = min(settings.min_views, len(views))
+        if not _share_view(views, HullSettings(outside="unseen", min_views=least)):
+            raise CalibrationError(f"no point is seen by {least} of {', '.join(views.names)}; check their poses")
         return
     if _share_view(views):
         return

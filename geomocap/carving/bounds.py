@@ -79,13 +79,13 @@ def subject_cells(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarr
 def halve(
     views: PinholeViews,
     settings: HullSettings,
-    tables: tuple[np.ndarray, np.ndarray, np.ndarray],
+    tables: tuple[np.ndarray, np.ndarray, np.ndarray, int],
     cells: np.ndarray,
     origin: np.ndarray,
     edge: float,
 ) -> np.ndarray:
     """Divide cells of size `edge` into eight each and return those that may hold a point of the hull, (M, 3) int64."""
-    subject, seen, unseen = tables
+    subject, seen, unseen, least = tables
     parts = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     children = (2 * cells[:, None] + parts).reshape(-1, 3)
     high = origin + (children.max(axis=0) + 1) * (edge / 2)
@@ -97,7 +97,7 @@ def halve(
         seen,
         unseen,
         settings.tolerance,
-        settings.min_views if unseen.any() else 0,
+        least,
         origin,
         edge / 2,
         children,
@@ -105,11 +105,11 @@ def halve(
     return children[keep]
 
 
-def _tables(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Integral images of the silhouettes and of what is seen, and for which cameras the outside is unseen."""
+def _tables(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Integral images of the silhouettes and of what is seen, where the outside is unseen, cameras with a say."""
     subject = summed(views.masks)
-    unseen, valid = heard(views, settings)
-    return subject, summed(valid) if unseen.any() else subject, unseen
+    unseen, valid, least = heard(views, settings)
+    return subject, summed(valid) if unseen.any() else subject, unseen, least
 
 
 def _connected(cells: np.ndarray) -> np.ndarray:

@@ -12,12 +12,13 @@ from geomocap.carving.grid import Grid
 from geomocap.carving.hull import heard, hull
 from geomocap.carving.settings import HullSettings
 from geomocap.carving.views import PinholeViews
+from geomocap.errors import GeometryError
 
 RESOLUTION = 96  # of the others' hull; a hole that matters is many such voxels wide
 SAMPLES = 200  # rays through a hole, and through its rim
 LEAST_OTHERS = 3  # two cameras' hull is too bulky to say where the subject is thick
 SHARE = 0.75  # a false hole's rays cross at least this share of what its rim's rays cross
-ALL_BUT_ONE = HullSettings(tolerance=1)
+ALL_BUT_ONE = HullSettings(tolerance=1, min_views=LEAST_OTHERS + 1)
 EMPTY, NOBODY = -2, -1  # voxel outside the hull; voxel on which all cameras agree (else: the camera that doesn't)
 MOST_HOLES = 40  # largest first; more of them are noise that the evidence has to settle
 
@@ -46,13 +47,16 @@ def fill_false_holes(rig: Rig, views: PinholeViews, masks: list[np.ndarray]) -> 
     holes = [enclosed_holes(mask) for mask in masks]
     if np.count_nonzero(~views.empty()) <= LEAST_OTHERS or not any(holes):
         return result
-    box = subject_box(views, ALL_BUT_ONE)
+    try:
+        box = subject_box(views, ALL_BUT_ONE)
+    except GeometryError:  # cameras on one side bound nothing, so they contradict nothing
+        return result
     if box is None:
         return result
     grid = Grid.of_box(*box, resolution=RESOLUTION)
     occupied = hull(views, grid, ALL_BUT_ONE).indices()
     dissent = np.full(grid.shape, EMPTY, np.int8)
-    unseen, valid = heard(views, ALL_BUT_ONE)
+    unseen, valid, _ = heard(views, ALL_BUT_ONE)
     _find_dissent(views.projections, views.masks, valid, unseen, occupied, grid.origin, grid.voxel_size, dissent)
     for c, mask in enumerate(masks):
         filled = mask.copy()

@@ -30,7 +30,7 @@ def hull(views: PinholeViews, grid: Grid, settings: HullSettings = _DEFAULT) -> 
     Szeliski, Rapid octree construction from image sequences, CVGIP: Image Understanding 58(1), 1993; the integral
     images are Crow's summed-area tables (SIGGRAPH 1984).
     """
-    unseen, valid = heard(views, settings)
+    unseen, valid, least = heard(views, settings)
     occupancy = Occupancy.empty(grid.shape)
     subject = summed(views.masks)
     seen = summed(valid) if unseen.any() else subject
@@ -43,7 +43,7 @@ def hull(views: PinholeViews, grid: Grid, settings: HullSettings = _DEFAULT) -> 
         seen,
         unseen,
         settings.tolerance,
-        settings.min_views if unseen.any() else 0,
+        least,
         grid.origin,
         grid.voxel_size,
         grid.shape[2],
@@ -76,7 +76,7 @@ def hull_surface(views: PinholeViews, grid: Grid, settings: HullSettings = _DEFA
     return hull(views, grid, settings).surface_indices()
 
 
-def heard(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.ndarray]:
+def heard(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.ndarray, int]:
     """Tell of what each camera has a say.
 
     Returns
@@ -85,12 +85,17 @@ def heard(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.n
         What is outside the camera's view is unseen; for the others it is background.
     valid : (C, H, W) uint8
         1 where the camera sees anything: with `outside = "auto"` nothing where the silhouette is empty.
+    least : int
+        Cameras that must have a say of a voxel.
     """
-    if settings.outside != "auto":
-        return np.full(len(views), settings.outside == "unseen"), views.valid
+    if settings.outside == "empty":
+        return np.zeros(len(views), bool), views.valid, 0
+    if settings.outside == "unseen":
+        return np.ones(len(views), bool), views.valid, min(settings.min_views, len(views))
     empty = views.empty()
+    unseen = views.cut_off() | empty
     valid = np.where(empty[:, None, None], np.uint8(0), views.valid) if empty.any() else views.valid
-    return views.cut_off() | empty, valid
+    return unseen, valid, min(settings.min_views, np.count_nonzero(~empty)) if unseen.any() else 0
 
 
 def rounding_bounds(views: PinholeViews, grid: Grid) -> np.ndarray:

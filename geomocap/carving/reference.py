@@ -20,7 +20,7 @@ def visual_hull_numpy(views: PinholeViews, grid: Grid, settings: HullSettings = 
     H, W = views.masks.shape[1:]
     background = np.zeros(grid.shape, np.int64)
     visible = np.zeros(grid.shape, np.int64)
-    unseen, seen_at = heard(views, settings)
+    unseen, seen_at, least = heard(views, settings)
     for P, mask, valid, is_open in zip(views.projections, views.masks, seen_at, unseen, strict=True):
         n0, n1, w = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in P)
         front = w > 0
@@ -32,10 +32,7 @@ def visual_hull_numpy(views: PinholeViews, grid: Grid, settings: HullSettings = 
         seen = on_canvas & (valid[row, column] != 0)
         background += (seen & ~inside) if is_open else ~inside
         visible += seen if is_open else 1
-    stays = background <= settings.tolerance
-    if unseen.any():
-        stays &= visible >= settings.min_views
-    return stays.astype(np.uint8)
+    return ((background <= settings.tolerance) & (visible >= least)).astype(np.uint8)
 
 
 def visual_hull_brute(views: PinholeViews, grid: Grid) -> np.ndarray:

@@ -21,7 +21,9 @@ class HullSettings(Settings):
         "image's border; a camera whose silhouette is empty has no say at all in that frame",
     )
     min_views: int = Field(
-        default=2, ge=1, description="cameras that must have a say of a voxel, where it may be unseen (count)"
+        default=3,
+        ge=1,
+        description="cameras that must have a say of a voxel, where some may not see it (count)",
     )
     tolerance: int = Field(default=0, ge=0, description="cameras that may call a voxel background and it stays (count)")
 

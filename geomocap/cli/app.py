@@ -19,7 +19,7 @@ from geomocap.cli.jobs import CaptureFolder, ExistingRun, RunFolder, capture_job
 from geomocap.cli.keypoints import keypoints
 from geomocap.cli.progress import progress_bars
 from geomocap.cli.reports import capture_of, console, review_job, tell_clouds, tell_results
-from geomocap.cli.settings_options import with_settings
+from geomocap.cli.settings_options import with_file_of_options, with_settings
 from geomocap.config import Config
 from geomocap.run import Run
 from viz.files import render_file
@@ -156,6 +156,7 @@ def run(
 
 
 @app.command()
+@with_file_of_options
 def review(run: ExistingRun, workers: Workers = None) -> None:
     """Make the pictures and the report of a run anew, from its files."""
     with progress_bars() as progress:
@@ -164,6 +165,7 @@ def review(run: ExistingRun, workers: Workers = None) -> None:
 
 
 @app.command()
+@with_file_of_options
 def render(
     geometry: Annotated[
         Path, typer.Argument(metavar="GEOMETRY", help="Mesh, point cloud or voxel grid: PLY, PCD, OBJ, STL, GLB …")
@@ -172,6 +174,7 @@ def render(
         Path | None, typer.Argument(metavar="PICTURE.png", help="Picture to write; beside the file if not given.")
     ] = None,
     up: Annotated[Literal["x", "y", "z"], typer.Option("--up", help="World axis that points up.")] = "z",
+    workers: Workers = None,
 ) -> None:
     """Draw any geometry from four sides into a PNG, without a screen."""
     console.print(f"picture: {render_file(geometry, picture, up)}")

@@ -20,7 +20,7 @@ from geomocap.cli.execution import Workers, executor_for
 from geomocap.cli.jobs import CaptureFolder, capture_job
 from geomocap.cli.progress import progress_bars
 from geomocap.cli.reports import console, review_job, tell_results
-from geomocap.cli.settings_options import with_options_of
+from geomocap.cli.settings_options import with_file_of_options, with_options_of
 from geomocap.config import Config
 
 BUILT_IN: dict[str, Callable[[], AnimatedAsset]] = {"figure": figure, "mechanism": mechanism}
@@ -56,6 +56,7 @@ def synthesize(
     console.print(f"{capture}: {len(result.rig)} cameras, {settings.frames} frames; truth in {truth}")
 
 
+@with_file_of_options
 def import_(
     kind: Annotated[
         Literal["pose2sim", "colmap", "anipose", "caliscope", "opencv", "easymocap", "qualisys"],
@@ -73,6 +74,7 @@ def import_(
     size_mismatch: Annotated[
         SizeMismatch, typer.Option("--size-mismatch", help="pose2sim: how images came to another size than calibrated.")
     ] = "auto",
+    workers: Workers = None,
 ) -> None:
     """Turn another tool's session into a capture.
 
@@ -99,6 +101,7 @@ def import_(
     console.print(f"{capture}: {len(opened.cameras)} cameras, {opened.n_frames} frames at {opened.fps:g} fps")
 
 
+@with_file_of_options
 def convert(
     source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Calibration of any known format.")],
     target: Annotated[
@@ -108,12 +111,14 @@ def convert(
     metres_per_unit: Annotated[
         float, typer.Option("--metres-per-unit", min=1e-9, help="Metres in a unit of the calibration.")
     ] = 1.0,
+    workers: Workers = None,
 ) -> None:
     """Convert a calibration between the formats of aniposelib, caliscope, Pose2Sim, OpenCV, EasyMocap and COLMAP."""
     rig = convert_calibration(source, target, kind, metres_per_unit=metres_per_unit)
     console.print(f"{target}: {len(rig)} cameras")
 
 
+@with_file_of_options
 def demo(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for capture, truth and run.")] = Path("demo"),
     workers: Workers = None,

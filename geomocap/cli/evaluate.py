@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import typer
 from rich.table import Table
 
+from geomocap.cli.execution import Workers
 from geomocap.cli.progress import progress_bars
 from geomocap.cli.reports import console
 from geomocap.cli.settings_options import with_options_of
@@ -38,6 +39,7 @@ def evaluate(
         Path | None, typer.Option("--report", metavar="FILE.html", help="Page with plots and error pictures.")
     ] = None,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures as JSON.")] = None,
+    workers: Workers = None,
 ) -> None:
     """Compare a run with the truth: lengths in mm unless a name says otherwise, `%h` is per cent of the height.
 

@@ -10,10 +10,17 @@ from typing import Annotated
 import typer
 
 from geomocap.errors import SettingsError
-from geomocap.scheduling import threads
+from geomocap.scheduling import limit_threads, threads
+
+
+def _limited(workers: int | None) -> int | None:
+    limit_threads(workers)
+    return workers
+
 
 Workers = Annotated[
-    int | None, typer.Option("--workers", min=1, help="Threads to use; one for each core if not given.")
+    int | None,
+    typer.Option("--workers", min=1, callback=_limited, help="Threads to use; one for each core if not given."),
 ]
 Scheduler = Annotated[
     str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to map frames on, tcp://host:8786.")

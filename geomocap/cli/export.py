@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from geomocap.cli.execution import Workers
 from geomocap.cli.progress import progress_bars
 from geomocap.cli.reports import console
 from geomocap.cli.settings_options import with_settings
@@ -35,6 +36,7 @@ def export(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; RUN if not given.")
     ] = None,
+    workers: Workers = None,
 ) -> None:
     """Write motion files of a run for Blender, OpenSim, C3D tools, game engines and plots.
 

@@ -8,14 +8,18 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from geomocap.cli.execution import Workers
 from geomocap.cli.reports import console
+from geomocap.cli.settings_options import with_file_of_options
 from geomocap.inspection import describe
 
 
+@with_file_of_options
 def info(
     path: Annotated[
         Path, typer.Argument(metavar="PATH", help="Capture, run, calibration or truth folder, or a motion file.")
     ],
+    workers: Workers = None,
 ) -> None:
     """Say what a capture, a run, a calibration, a truth or a motion file holds, and what is wrong with it.
 

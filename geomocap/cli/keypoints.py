@@ -9,9 +9,11 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from geomocap.cli.execution import Workers
 from geomocap.cli.export import report_exported
 from geomocap.cli.jobs import ExistingRun
 from geomocap.cli.reports import capture_of, console
+from geomocap.cli.settings_options import with_file_of_options
 from geomocap.errors import GeomocapError
 from geomocap.export.run_export import export_run
 from geomocap.pipeline.keypoints import FollowedKeyPoints, clear_results, run_fps, run_trajectories
@@ -21,6 +23,7 @@ from geomocap.tracking.keypoint_file import KeyPointFile, read_keypoints, write_
 from geomocap.tracking.keypoints import Measured
 
 
+@with_file_of_options
 def keypoints(
     run: ExistingRun,
     points: Annotated[
@@ -36,6 +39,7 @@ def keypoints(
     port: Annotated[
         int, typer.Option("--port", min=1, max=65535, help="Port of the page; the next free one if it is taken.")
     ] = 8080,
+    workers: Workers = None,
 ) -> None:
     """Follow key-points on the surface, given as `[[keypoint]]` tables: name, center (m), radius (m), frame.
 

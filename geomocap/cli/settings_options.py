@@ -17,7 +17,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from geomocap.config import Config, load_config
-from geomocap.settings import Settings, load_settings
+from geomocap.errors import SettingsError
+from geomocap.settings import Settings, load_settings, read_settings
 
 _PREFIX, _SEPARATOR = "set__", "__"
 Command = Callable[..., None]
@@ -39,6 +40,41 @@ def with_options_of(model: type[Settings]) -> Callable[[Command], Command]:
     """
     build = functools.partial(load_settings, model)
     return _with_options("settings", list(_leaves(model, ())), build, "Settings file: keys as below, without tables.")
+
+
+def with_file_of_options(command: Command) -> Command:
+    """Give a command without settings `--config FILE.toml`: the file's keys are the command's own options."""
+    signature = inspect.signature(command, eval_str=True)
+    option = typer.Option(
+        "--config",
+        metavar="FILE.toml",
+        help="Settings file: keys are the options here, without the dashes before them.",
+        is_eager=True,
+        callback=_read_options,
+    )
+    parameters = [*signature.parameters.values(), _parameter("config_file", Annotated[Path | None, option])]
+
+    @functools.wraps(command)
+    def wrapper(config_file: Path | None = None, **arguments: Any) -> None:
+        command(**arguments)
+
+    wrapper.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    wrapper.__annotations__ = {p.name: p.annotation for p in parameters}
+    return wrapper
+
+
+def _read_options(context: typer.Context, file: Path | None) -> Path | None:
+    """Take the defaults of a command's options from a file."""
+    if file is None:
+        return None
+    named = {flag.lstrip("-"): p.name for p in context.command.params for flag in p.opts if flag.startswith("--")}
+    expected = sorted(named.keys() - {"config", "help"})
+    values = read_settings(file)
+    for key in values:
+        if key not in expected:
+            raise SettingsError(f"{file}: unknown setting {key}; expected {', '.join(expected)}")
+    context.default_map = {str(named[key]): value for key, value in values.items()}
+    return file
 
 
 def _with_options(

@@ -31,3 +31,9 @@ def test_placeholders_are_shown(capsys, monkeypatch):
 def test_a_run_that_must_be_there_is_not_said_to_be_made(name):
     run = next(p for p in COMMANDS[name].params if p.name == "run")
     assert "Run folder" in run.help and "made" not in run.help
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_command_takes_a_settings_file_and_a_number_of_workers(name):
+    flags = {flag for p in COMMANDS[name].params for flag in p.opts}
+    assert {"--config", "--workers"} <= flags

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data_tools.calibration_files import read_calibration
 from geomocap.geometry import BodyPoints, Voxels
 from tests.cli.conftest import CAMERAS, FRAMES, SETTINGS
 
@@ -138,3 +139,15 @@ def test_single_scan_gets_its_ellipsoids(finished, geomocap, tmp_path):
     ellipsoids = np.load(tmp_path / "run/ellipsoids.npz")
     assert ellipsoids["centers"].shape[0] == 1 and ellipsoids["centers"].shape[1] >= 4
     assert not (tmp_path / "run/skeleton.npz").exists()
+
+
+def test_a_file_holds_the_options_of_a_command_without_settings(small_capture, geomocap, tmp_path):
+    settings = tmp_path / "options.toml"
+    settings.write_text('format = "opencv"\nmetres-per-unit = 2.0\nworkers = 1\n')
+    geomocap("convert-calibration", small_capture / "sparse", tmp_path / "scaled", "--config", settings)
+    given, scaled = (read_calibration(p) for p in (small_capture / "sparse", tmp_path / "scaled"))
+    ratio = np.linalg.norm(scaled.centers, axis=1) / np.linalg.norm(given.centers, axis=1)
+    np.testing.assert_allclose(ratio, 2.0, rtol=1e-6)
+    settings.write_text("metres = 1.0\n")
+    refused = geomocap("convert-calibration", small_capture, tmp_path / "b", "--config", settings, check=False)
+    assert "unknown setting metres; expected format, metres-per-unit, workers" in refused.stderr

@@ -143,7 +143,7 @@ def test_outside_a_view_is_an_explicit_choice():
     views = PinholeViews.of(P, masks, seen)
     grid = Grid(np.array([-0.6, -0.6, -0.1]), 2 / 64, (40, 40, 64))
     empty = visual_hull(views, grid, HullSettings(outside="empty"))
-    unseen = visual_hull(views, grid, HullSettings(outside="unseen"))
+    unseen = visual_hull(views, grid, HullSettings(outside="unseen", min_views=2))
     whole = visual_hull(PinholeViews.of(P, masks), grid)
     pair = visual_hull(views.without(2), grid)
     assert empty.sum() < whole.sum() < unseen.sum() < pair.sum()

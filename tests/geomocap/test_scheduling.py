@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import threading
 
+import cv2
+import numba
 import pytest
 
-from geomocap.scheduling import map_items, threads
+from geomocap.scheduling import limit_threads, map_items, threads
 
 
 def test_results_come_in_order_and_progress_is_told():
@@ -41,3 +44,16 @@ def test_threads_share_the_cores():
     with threads(2) as executor:
         names = set(executor.map(lambda _: threading.current_thread().name, range(8)))
     assert 1 <= len(names) <= 2
+
+
+def test_a_limit_holds_for_executors_and_kernels_made_afterwards():
+    try:
+        limit_threads(1)
+        with threads() as executor:
+            assert executor._max_workers == 1
+        assert numba.get_num_threads() == 1 and cv2.getNumThreads() == 1
+    finally:
+        limit_threads(None)
+    with threads() as executor:
+        assert executor._max_workers == (os.cpu_count() or 1)
+    assert numba.get_num_threads() == numba.config.NUMBA_NUM_THREADS
