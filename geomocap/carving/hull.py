@@ -95,7 +95,7 @@ def heard(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.n
     empty = views.empty()
     unseen = views.cut_off() | empty
     valid = np.where(empty[:, None, None], np.uint8(0), views.valid) if empty.any() else views.valid
-    return unseen, valid, min(settings.min_views, np.count_nonzero(~empty)) if unseen.any() else 0
+    return unseen, valid, min(settings.min_views, int((~empty).sum())) if unseen.any() else 0
 
 
 def rounding_bounds(views: PinholeViews, grid: Grid) -> np.ndarray:
