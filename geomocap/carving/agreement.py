@@ -32,7 +32,7 @@ def check_cameras(views: PinholeViews, settings: HullSettings) -> None:
     if len(views) < 2:
         return
     if settings.outside != "empty":
-        least = min(settings.min_views, len(views))
+        least = settings.views_of(len(views))
         if not _share_view(views, HullSettings(outside="unseen", min_views=least)):
             raise CalibrationError(f"no point is seen by {least} of {', '.join(views.names)}; check their poses")
         return

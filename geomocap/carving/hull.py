@@ -91,11 +91,11 @@ def heard(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.n
     if settings.outside == "empty":
         return np.zeros(len(views), bool), views.valid, 0
     if settings.outside == "unseen":
-        return np.ones(len(views), bool), views.valid, min(settings.min_views, len(views))
+        return np.ones(len(views), bool), views.valid, settings.views_of(len(views))
     empty = views.empty()
     unseen = views.cut_off() | empty
     valid = np.where(empty[:, None, None], np.uint8(0), views.valid) if empty.any() else views.valid
-    return unseen, valid, min(settings.min_views, int((~empty).sum())) if unseen.any() else 0
+    return unseen, valid, settings.views_of(int((~empty).sum())) if unseen.any() else 0
 
 
 def rounding_bounds(views: PinholeViews, grid: Grid) -> np.ndarray:

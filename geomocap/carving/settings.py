@@ -21,11 +21,16 @@ class HullSettings(Settings):
         "image's border; a camera whose silhouette is empty has no say at all in that frame",
     )
     min_views: int = Field(
-        default=3,
-        ge=1,
-        description="cameras that must have a say of a voxel, where some may not see it (count)",
+        default=0,
+        ge=0,
+        description="cameras that must have a say of a voxel, where some may not see it (count); 0: half of those that "
+        "see the subject, three at least",
     )
     tolerance: int = Field(default=0, ge=0, description="cameras that may call a voxel background and it stays (count)")
+
+    def views_of(self, cameras: int) -> int:
+        """Return how many of so many cameras must have a say of a voxel."""
+        return min(self.min_views or max(3, (cameras + 1) // 2), cameras)
 
 
 class ConsistencySettings(Settings):
