@@ -1,0 +1,77 @@
+"""Made-up subjects with known joints, unlike a person: what holds for these was tuned to none of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from data_tools.asset import AnimatedAsset, Pose
+from data_tools.figure import Part, assemble, figure
+from data_tools.solids import box, capsule, cylinder, ellipsoid
+
+X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+
+
+def runner(speed: float = 2.5, cycle: float = 0.9, duration: float = 3.0) -> AnimatedAsset:
+    """Make the built-in figure run forwards at so many metres a second, a double step in `cycle` seconds."""
+    still = figure(duration=cycle)
+
+    def pose(time: float | None) -> Pose:
+        there = still.pose(None if time is None else time % cycle)
+        moved = there.asset_from_joint.copy()
+        moved[:, 1, 3] -= speed * (time or 0.0)
+        return Pose(moved)
+
+    return replace(still, name="runner", pose=pose, duration=duration).standing()
+
+
+def spider(duration: float = 2.0) -> AnimatedAsset:
+    """Make a trunk, an abdomen and eight legs of two links: 18 bodies."""
+    brown, dark, leg = (0.6, 0.45, 0.3), (0.45, 0.35, 0.3), (0.7, 0.6, 0.4)
+    parts = [
+        Part("trunk", "", (0, 0, 0.3), (ellipsoid((0.11, 0.14, 0.07), (0, 0, 0)),), brown, ((Z, 0, 10, 1, 0.0),)),
+        Part("abdomen", "trunk", (0, 0.13, 0), (ellipsoid((0.13, 0.18, 0.11), (0, 0.17, 0.03)),), dark,
+             ((X, 8, 14, 1, 0.5), (Z, 0, 16, 1, 1.8))),
+    ]  # fmt: skip
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        for k in range(4):
+            phase = np.pi * (k + (sign > 0)) + 0.3 * k
+            spread = sign * (-50 + 33 * k)
+            parts += [
+                Part(f"{side}_femur_{k}", "trunk", (sign * 0.09, -0.08 + 0.055 * k, 0), (capsule(0.28, (0.03, 0.024)),),
+                     leg, ((Z, spread, 16, 1, phase), (Y, sign * -115, 13, 1, phase + 1.2))),
+                Part(f"{side}_tibia_{k}", f"{side}_femur_{k}", (0, 0, -0.3), (capsule(0.36, (0.022, 0.014)),),
+                     brown, ((Y, sign * 85, 24, 1, phase + 2.0),)),
+            ]  # fmt: skip
+    return assemble("spider", parts, duration).standing()
+
+
+def snake(links: int = 10, duration: float = 2.0) -> AnimatedAsset:
+    """Make a chain of equal links along which a wave runs."""
+    parts = []
+    for k in range(links):
+        size = 0.05 * (1.2 - 0.06 * k)
+        parts.append(
+            Part(
+                f"link_{k}", f"link_{k - 1}" if k else "", (0, 0.16, 0) if k else (0, -0.8, 0.08),
+                (ellipsoid((size, 0.095, size), (0, 0.08, 0)),), (0.5 + 0.04 * (k % 2), 0.65, 0.35),
+                ((Z, 0, 27, 1, -0.8 * k), (X, 0, 5, 2, -0.5 * k)),
+            )
+        )  # fmt: skip
+    return assemble("snake", parts, duration).standing()
+
+
+def fan(duration: float = 2.0) -> AnimatedAsset:
+    """Make a stand, a head that swings to and fro, and a rotor of three blades before it: 3 bodies."""
+    turned = [np.deg2rad(120 * k) for k in range(3)]
+    blades = tuple(ellipsoid((0.07, 0.012, 0.07), (0.13 * np.cos(a), -0.02, 0.13 * np.sin(a))) for a in turned)
+    parts = [
+        Part("stand", "", (0, 0, 0), (cylinder(0.16, 0.02, 2), box((-0.03, -0.03, 0), (0.03, 0.03, 0.7))),
+             (0.6, 0.6, 0.65)),
+        Part("head", "stand", (0, 0, 0.72), (ellipsoid((0.09, 0.13, 0.09), (0, 0, 0.06)),), (0.75, 0.6, 0.4),
+             ((Z, 0, 45, 1, 0.0),)),
+        Part("rotor", "head", (0, -0.16, 0.06), (cylinder(0.04, 0.03, 1), *blades), (0.45, 0.55, 0.75),
+             ((Y, 0, 170, 1, 0.9),)),
+    ]  # fmt: skip
+    return assemble("fan", parts, duration).standing()

@@ -1,0 +1,189 @@
+"""How good whole runs are: the table of the README, made anew.
+
+`python -m tests.benchmarks.quality FOLDER [NAME …]` synthesizes each capture into FOLDER, runs it with the defaults,
+compares it with its truth and prints one row each. What is there already is taken, so that it may be stopped and
+shared between processes. Captures of characters that are files need the folder of data in `GEOMOCAP_DATA`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from data_tools.asset import AnimatedAsset
+from data_tools.figure import figure, mechanism
+from data_tools.gltf import load_gltf
+from data_tools.synthesize import SynthesisSettings, synthesize
+from geomocap.capture import Capture
+from tests.benchmarks.creatures import fan, runner, snake, spider
+
+DATA = Path(os.environ.get("GEOMOCAP_DATA", "."))
+
+
+def man() -> AnimatedAsset:
+    return load_gltf(DATA / "characters" / "CesiumMan.glb", None)
+
+
+def horse(clip: str) -> Callable[[], AnimatedAsset]:
+    return lambda: load_gltf(DATA / "characters" / "horse-animations.glb", clip)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row of the table.
+
+    Attributes
+    ----------
+    subject : callable
+        Makes the animated subject.
+    synthesis : dict
+        How its capture differs from eight cameras of 640×480 and 60 frames at 30 a second.
+    change : callable, optional
+        What is done to the folders of capture and truth afterwards.
+    flags : tuple of str
+        What the run is told beyond the defaults.
+    """
+
+    subject: Callable[[], AnimatedAsset]
+    synthesis: dict[str, float] = field(default_factory=dict)
+    change: Callable[[Path, Path], None] | None = None
+    flags: tuple[str, ...] = ()
+
+
+def give_silhouettes(grow: int) -> Callable[[Path, Path], None]:
+    """Give the capture the true silhouettes, `grow` pixels too large (or, if negative, too small)."""
+
+    def change(capture: Path, truth: Path) -> None:
+        work = cv2.dilate if grow > 0 else cv2.erode
+        for file in sorted((truth / "masks").rglob("*.png")):
+            mask = work(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), np.ones((3, 3), np.uint8), iterations=abs(grow))
+            target = capture / file.relative_to(truth)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(target), mask)
+
+    return change
+
+
+def reverse(capture: Path, truth: Path) -> None:
+    """Let capture and truth run backwards."""
+    for folder in (*(capture / "images").iterdir(), *(truth / "masks").iterdir()):
+        files = sorted(folder.glob("*.png"))
+        kept = [f.rename(f.with_suffix(".kept")) for f in files]
+        for file, old in zip(files, reversed(kept), strict=True):
+            old.rename(file)
+    with np.load(truth / "truth.npz") as loaded:
+        arrays = dict(loaded)
+    T = len(arrays["vertices"])
+    moving = ("vertices", "joint_positions", "joint_rotations")
+    assert all(len(arrays[name]) == T for name in moving)
+    np.savez_compressed(truth / "truth.npz", **{k: v[::-1] if k in moving else v for k, v in arrays.items()})
+
+
+def crop(capture: Path, truth: Path) -> None:
+    """Let three of the cameras see a part of the subject only: cut off the feet, the head, the right half."""
+    windows = {1: (slice(0, 300), slice(None)), 4: (slice(190, None), slice(None)), 6: (slice(None), slice(0, 330))}
+    opened = Capture.open(capture)
+    rig, names = opened.rig, opened.cameras
+    for c, (rows, columns) in windows.items():
+        for file in (*(capture / "images" / names[c]).glob("*.png"), capture / "background" / f"{names[c]}.png"):
+            cv2.imwrite(str(file), cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[rows, columns])
+        image = cv2.imread(str(capture / "images" / names[c] / "000000.png"))
+        camera = rig.cameras[c]
+        camera.principal_point_y -= rows.start or 0
+        camera.height, camera.width = image.shape[:2]
+    rig.write(capture / "sparse")
+
+
+CASES = {
+    "man walking, 30 fps": Case(man),
+    "the same, 15 fps": Case(man, {"fps": 15}),
+    "5 cameras": Case(man, {"cameras": 5}),
+    "three of 8 cameras see a part of him only": Case(man, change=crop),
+    "half the texture contrast": Case(man, {"texture_contrast": 0.14}),
+    "silhouettes given, eroded by a pixel": Case(man, change=give_silhouettes(-1)),
+    "dilated by a pixel": Case(man, change=give_silhouettes(1)),
+    "another seed": Case(man, flags=("--tracking.seed", "1", "--nodes.seed", "1")),
+    "frames reversed": Case(man, change=reverse),
+    "horse walking": Case(horse("Walk")),
+    "horse turning": Case(horse("Turn_Left")),
+    "horse rearing": Case(horse("Rear")),
+    "horse kicking": Case(horse("Kick")),
+    "mechanism": Case(mechanism),
+    "figure running, 2.5 m/s": Case(runner),
+    "spider": Case(spider),
+    "snake": Case(snake),
+    "fan": Case(fan),
+    "figure, 4 cameras 320×240, 15 fps": Case(figure, {"cameras": 4, "width": 320, "height": 240, "fps": 15}),
+    "figure, 4 cameras": Case(figure, {"cameras": 4}),
+    "horse walking, 4 cameras": Case(horse("Walk"), {"cameras": 4}),
+    "man walking, 4 cameras": Case(man, {"cameras": 4}),
+}
+
+
+def folder_name(name: str) -> str:
+    return "".join(c if c.isalnum() else "_" for c in name)
+
+
+def measure(name: str, root: Path) -> dict[str, float]:
+    """Make a capture, run it and compare it with its truth, unless that was done before."""
+    case, folder = CASES[name], root / folder_name(name)
+    figures = folder / "figures.json"
+    if not figures.exists():
+        capture, truth, run = folder / "capture", folder / "truth", folder / "run"
+        shutil.rmtree(folder, ignore_errors=True)
+        synthesize(case.subject(), capture, truth, SynthesisSettings(**case.synthesis))
+        if case.change is not None:
+            case.change(capture, truth)
+        _call("run", capture, run, "--no-pictures", *case.flags)
+        _call("evaluate", run, truth, "--json", figures)
+    return json.loads(figures.read_text())
+
+
+def row(name: str, figures: dict[str, float]) -> str:
+    """Write the figures as a row of the README's table."""
+    edges = round(figures["skeleton.true_edges_found"] * (figures["truth.bodies"] - 1))
+    cells = (
+        name,
+        f"{figures['bodies.found']:.0f} / {figures['truth.bodies']:.0f}",
+        f"{figures['bodies.adjusted_rand_index']:.2f}",
+        f"{figures['bodies.core_adjusted_rand_index']:.2f}",
+        f"{figures['joints.recall_at_5%h']:.2f} / {figures['joints.precision_at_10%h']:.2f}",
+        f"{figures['joints.mean_error']:.0f}",
+        f"{edges} / {figures['truth.bodies'] - 1:.0f}, {figures['skeleton.false_edges']:.0f}",
+        f"{figures['motion.body_rotation_error_deg']:.1f}",
+    )
+    return "| " + " | ".join(cells) + " |"
+
+
+def _call(command: str, *arguments: Path | str) -> None:
+    line = [sys.executable, "-m", "geomocap", command, *map(str, arguments)]
+    subprocess.run(line, check=True, stdout=subprocess.DEVNULL)
+
+
+HEAD = (
+    "| capture | bodies found / true | ARI | core ARI | joints recall 5 % / precision | error (mm) | edges, false "
+    "| rotation (°) |\n|---|---|---|---|---|---|---|---|"
+)
+
+
+def main() -> None:
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
+    print(
+        "| capture | bodies found / true | ARI | core ARI | joints recall 5 % / precision | error (mm) | edges, false |"
+    )
+    for name in sys.argv[2:] or CASES:
+        print(row(name, measure(name, Path(sys.argv[1]))), flush=True)
+
+
+if __name__ == "__main__":
+    main()
