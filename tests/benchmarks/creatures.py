@@ -65,7 +65,7 @@ def snake(links: int = 10, duration: float = 2.0) -> AnimatedAsset:
 def fan(duration: float = 2.0) -> AnimatedAsset:
     """Make a stand, a head that swings to and fro, and a rotor of three blades before it: 3 bodies."""
     turned = [np.deg2rad(120 * k) for k in range(3)]
-    blades = tuple(ellipsoid((0.07, 0.012, 0.07), (0.13 * np.cos(a), -0.02, 0.13 * np.sin(a))) for a in turned)
+    blades = tuple(ellipsoid((0.08, 0.012, 0.08), (0.11 * np.cos(a), -0.02, 0.11 * np.sin(a))) for a in turned)
     parts = [
         Part("stand", "", (0, 0, 0), (cylinder(0.16, 0.02, 2), box((-0.03, -0.03, 0), (0.03, 0.03, 0.7))),
              (0.6, 0.6, 0.65)),
