@@ -59,6 +59,8 @@ class SubjectModel:
         Diagonal of the box around the subject at rest.
     spacing : float, metres
         Distance of neighbouring points.
+    up : int
+        World axis that points up, 0 to 2.
     """
 
     points: np.ndarray
@@ -79,6 +81,7 @@ class SubjectModel:
     poses: np.ndarray
     extent: float
     spacing: float
+    up: int = 2
 
     def __post_init__(self) -> None:
         count, joints = len(self.points), len(self.joint_bodies)
@@ -110,6 +113,8 @@ class SubjectModel:
         for name in ("points", "normals", "skin_shares", "joints", "joint_axes", "poses", "origin"):
             if not np.isfinite(getattr(self, name)).all():
                 raise GeometryError(f"{name} holds numbers that are not finite")
+        if self.up not in (0, 1, 2):
+            raise GeometryError(f"up is {self.up}, expected an axis, 0 to 2")
         if not (self.extent > 0 and self.spacing > 0):
             raise GeometryError("extent and spacing must be positive")
         _ = self.linkage  # the tree is checked
@@ -146,6 +151,15 @@ class SubjectModel:
             origin=linkage.origin,
             poses=poses,
         )
+
+    def turned_up(self, up: int) -> SubjectModel:
+        """Return the model in a world in which another axis points up; the axes keep their cyclic order."""
+        if up == self.up:
+            return self
+        turn = np.roll(np.eye(3), up - self.up, axis=0)
+        places = ("points", "normals", "joints", "joint_axes", "joint_limits", "origin")
+        turned = {name: getattr(self, name) @ turn.T for name in places}
+        return replace(self, **turned, poses=turn @ self.poses @ turn.T, up=up)
 
     def widened(self, bodies: BodyMotion) -> SubjectModel:
         """Return the model with limits that hold the turns of a motion, too."""
@@ -193,7 +207,7 @@ def read_model(path: Path) -> SubjectModel:
         raise GeometryError(f"{path}: model without the array {missing[0]}; make it anew")
     values: dict[str, Any] = {name: arrays[name] for name in names}
     try:
-        for name, kind in (("root", int), ("extent", float), ("spacing", float)):
+        for name, kind in (("root", int), ("extent", float), ("spacing", float), ("up", int)):
             values[name] = kind(values[name])
         return SubjectModel(**values)
     except (GeometryError, TypeError, ValueError) as error:

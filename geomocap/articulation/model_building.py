@@ -47,6 +47,7 @@ def build_model(
     hinge: np.ndarray,
     read: Callable[[int], BodyCloud],
     spacing: float,
+    up: int = 2,
 ) -> SubjectModel:
     """Make the model of a subject from its (refined) skeleton, bodies, and the geometry of its frames.
 
@@ -64,6 +65,8 @@ def build_model(
         `read(frame) -> BodyCloud`.
     spacing : float, metres
         Distance of neighbouring points.
+    up : int
+        World axis that points up, 0 to 2.
 
     Raises
     ------
@@ -97,6 +100,7 @@ def build_model(
         skeleton.local_rotations[key_poses(skeleton.local_rotations)],
         float(np.linalg.norm(np.ptp(points, axis=0))),
         float(spacing * CELL),
+        up,
     )
 
 

@@ -111,3 +111,8 @@ class Job:
     def up(self) -> str:
         """The world axis that points up."""
         return self.capture.info.up if self.capture is not None else self.config.scans.up
+
+    @property
+    def up_axis(self) -> int:
+        """Number of that axis, 0 to 2."""
+        return "xyz".index(self.up)

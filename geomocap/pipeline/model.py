@@ -24,7 +24,7 @@ def make_model(job: Job, geometry: Geometry, found: MotionSkeleton, bodies: Moti
     hinge = np.array([joint.hinge for joint in found.joints], dtype=bool)
     try:
         with job.run.timed("model") as count:
-            model = build_model(found, bodies, hinge, read, geometry.spacing)
+            model = build_model(found, bodies, hinge, read, geometry.spacing, job.up_axis)
             count["items"] = len(model.points)
     except GeometryError as error:
         return [str(error)]

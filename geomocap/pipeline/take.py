@@ -24,13 +24,11 @@ from geomocap.segmentation.ellipsoids import Ellipsoids, fit_ellipsoids
 from geomocap.skeleton.motion_skeleton import skeleton_of_motion
 from geomocap.skeleton.skeleton import Skeleton
 
-_AXES: dict[str, int] = {"x": 0, "y": 1, "z": 2}
-
 
 def segment_with_model(job: Job, geometry: Geometry, source_key: str) -> str:
     """Follow the job's model, write what a segmentation writes, and return the stage's key."""
     assert job.model is not None
-    model = read_model(job.model)
+    model = read_model(job.model).turned_up(job.up_axis)
     patches = None
     if job.capture is not None and job.config.segmentation.paths != "nodes":
         patches = tracks(job)
@@ -55,7 +53,7 @@ def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) ->
             read,
             frames,
             geometry.spacing,
-            _AXES[job.up],
+            job.up_axis,
             patch_paths(job.run.read_npz("tracks.npz")) if patches else None,
             job.config.take,
             job.progress,

@@ -2,7 +2,8 @@ import numpy as np
 import pygltflib
 import pytest
 
-from geomocap.articulation.model import SubjectModel, read_model
+from geomocap.articulation.kinematics import JointMotion, body_motion
+from geomocap.articulation.model import SubjectModel, read_model, rotation_limits
 from geomocap.articulation.model_building import BodyCloud, build_model, key_poses
 from geomocap.errors import GeometryError
 from geomocap.export.run_export import export_run
@@ -95,6 +96,28 @@ def test_model_file_comes_back_as_it_was(model, tmp_path):
     again = read_model(tmp_path / "model.npz")
     for name in SubjectModel.__dataclass_fields__:
         np.testing.assert_array_equal(getattr(again, name), getattr(model, name))
+
+
+def test_a_model_moves_in_another_world_as_it_does_in_its_own(model):
+    """Turned so that y points up it takes the same poses, turned, within the same limits."""
+    turned = model.turned_up(1)
+    assert turned.up == 1 and turned.turned_up(2).up == 2
+    np.testing.assert_array_equal(turned.points[:, 1], model.points[:, 2])
+    np.testing.assert_array_equal(turned.turned_up(2).points, model.points)
+    change = np.roll(np.eye(3), -1, axis=0)
+    assert np.linalg.det(change) > 0
+    before, after = (
+        body_motion(m.linkage, JointMotion(m.poses, np.tile(m.origin, (len(m.poses), 1)))) for m in (model, turned)
+    )
+    for one, other in zip(*(b.carry(*m) for b, m in ((before, skin(model)), (after, skin(turned)))), strict=True):
+        np.testing.assert_allclose(other, one @ change.T, atol=1e-9)
+    limits = rotation_limits(turned.poses[:, turned.joint_bodies[:, 1]])
+    assert (turned.joint_limits[:, 0] <= limits[:, 0] + 1e-9).all()
+    assert (turned.joint_limits[:, 1] >= limits[:, 1] - 1e-9).all()
+
+
+def skin(model):
+    return model.points, model.skin_bodies, model.skin_shares
 
 
 def broken(arrays, how):
