@@ -61,13 +61,16 @@ def test_motion_files_hold_key_points_followed_since_and_these_go_with_their_bod
     assert "tip" not in read_trc(done.run.path / "motion.trc").names
 
 
-def test_one_scan_leaves_no_motion_of_the_sequence_before_it(job):
+def test_one_scan_leaves_no_motion_and_no_report_of_the_sequence_before_it(job):
     sequence = job(scanned(5), M3)
     motion_files(sequence, "scans")
+    (sequence.run.path / "review").mkdir()
+    motion_files(sequence, "scans")
+    assert (sequence.run.path / "review").exists(), "nothing has changed, so its report is still right"
     assert (sequence.run.path / "skeleton.npz").exists() and (sequence.run.path / "motion.bvh").exists()
     motion_files(job(scanned(5)[:1], M3), "scans")
     assert not (sequence.run.path / "skeleton.npz").exists()
-    assert not list(sequence.run.path.glob("motion.*"))
+    assert not list(sequence.run.path.glob("motion.*")) and not (sequence.run.path / "review").exists()
     assert len(sequence.run.read_npz("ellipsoids.npz")["centers"]) == 1
     motion_files(job(scanned(5), M3), "scans")
     assert (sequence.run.path / "motion.bvh").exists()
