@@ -38,9 +38,9 @@ class MotionSkeletonSettings(Settings):
         default=0.1, ge=0, lt=1, description="hinge: turns about other axes are less than this share of all (0..1)"
     )
     interface_weight: float = Field(
-        default=0.15, ge=0, description="tree: weight of a joint's distance from where its bodies touch (no unit)"
+        default=0.05, ge=0, description="tree: weight of a joint's distance from where its bodies touch (no unit)"
     )
-    gap_weight: float = Field(default=0.5, ge=0, description="tree: weight of the bodies' distance (no unit)")
+    gap_weight: float = Field(default=0.05, ge=0, description="tree: weight of the bodies' distance (no unit)")
     contact_weight: float = Field(
         default=0.01, ge=0, description="tree: cost of bodies without common border (extents)"
     )

@@ -111,6 +111,19 @@ def _lift(P, pixel, depth, flow, known, shift):
                     weight[c] = 1.0 / (1.0 + square / _FLOW_SIGMA**2)
 
 
+def orthonormal(frames: np.ndarray) -> np.ndarray:
+    """Take the rounding errors out of rotations (N, 3, 3): one Newton step towards the nearest rotation.
+
+    Frames are carried by each other's motions, so that errors would add up and grow exponentially in long recordings.
+
+    References
+    ----------
+    Higham, Computing the polar decomposition with applications, SIAM J. Sci. Stat. Comput. 7(4), 1986 (inverse-free
+    variant).
+    """
+    return 1.5 * frames - 0.5 * frames @ (np.swapaxes(frames, -1, -2) @ frames)
+
+
 def carried(
     positions: np.ndarray,
     frames: np.ndarray,

@@ -15,6 +15,7 @@ from geomocap.scheduling import map_items, threads
 from geomocap.tracking.frame_views import FrameViews
 from geomocap.tracking.joining import join_broken
 from geomocap.tracking.lone_depths import adjust_depths
+from geomocap.tracking.patch_motion import orthonormal
 from geomocap.tracking.patch_search import Followed, carry_lost, hiding_depth, judge, new_views, renewed, search
 from geomocap.tracking.patches import Alignment, Patches, doubted, with_templates
 from geomocap.tracking.reacquisition import reacquire
@@ -177,6 +178,7 @@ def _next(
     state = replace(state.remembering(good), pieces=state.pieces + new)
     found = carry_lost(state, doubted(state.patches, found), good)
     state, found, regained = _regain(state, found, good, view, settings, frame, spacing)
+    found = found.at(found.positions, orthonormal(found.frames))
     old = state.patches
     shift = found.positions - old.positions
     turn = Rotation.from_matrix(found.frames @ np.swapaxes(old.frames, 1, 2)).as_rotvec()

@@ -139,8 +139,9 @@ def measure(name: str, root: Path) -> dict[str, float]:
     figures = folder / "figures.json"
     if not figures.exists():
         capture, truth, run = folder / "capture", folder / "truth", folder / "run"
-        shutil.rmtree(folder, ignore_errors=True)
-        synthesize(case.subject(), capture, truth, SynthesisSettings(**case.synthesis))
+        if case.change is not None or not (capture / "capture.toml").exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            synthesize(case.subject(), capture, truth, SynthesisSettings(**case.synthesis))
         if case.change is not None:
             case.change(capture, truth)
         _call("run", capture, run, "--no-pictures", *case.flags)

@@ -5,7 +5,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
+from geomocap.segmentation.rotations import nearest_rotation
 from geomocap.tracking.companions import Companions
+from geomocap.tracking.patch_motion import carried, orthonormal
 
 RNG = np.random.default_rng(0)
 LIMB, TRUNK = 30, 30
@@ -114,3 +116,27 @@ def test_those_that_left_count_no_more():
     known[0] = False
     left = companions.select(rest).placed(IDENTITY[rest], known, POSITIONS[rest], FRAMES[rest])[2]
     assert not left[0]
+
+
+@pytest.mark.parametrize("mended", [True, False])
+def test_frames_that_carry_each_other_stay_rotations_only_if_rounding_is_taken_out(mended):
+    """Two patches, one measured in each frame, the other carried along: their rounding errors feed each other."""
+    frames, positions = FRAMES[:2].copy(), POSITIONS[:2]
+    steps = Rotation.random(400, random_state=3).as_matrix()
+    for k, turn in enumerate(steps):
+        measured, lost = np.array([k % 2]), np.array([1 - k % 2])
+        new = frames.copy()
+        new[measured] = turn @ frames[measured]
+        new[lost] = carried(positions, frames, measured[:, None], positions, new, lost)[1][:, 0]
+        frames = orthonormal(new) if mended else new
+        with np.errstate(all="ignore"):
+            off = np.abs(frames @ np.swapaxes(frames, 1, 2) - np.eye(3)).max()
+        if not off < 1e-6:
+            break
+    assert (off < 1e-14) == mended
+
+
+def test_one_newton_step_is_the_nearest_rotation():
+    rng = np.random.default_rng(5)
+    frames = Rotation.random(50, random_state=4).as_matrix() + 1e-6 * rng.normal(size=(50, 3, 3))
+    assert_allclose(orthonormal(frames), nearest_rotation(frames), atol=1e-11)
