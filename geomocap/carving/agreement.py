@@ -72,7 +72,7 @@ def check_silhouettes(
     GeometryError
         If more are empty.
     """
-    empty = [views.names[c] for c in np.flatnonzero(views.empty())]
+    empty = [views.names[c] for c in np.flatnonzero(views.blind())]
     left = len(views) - len(empty)
     auto = settings.outside == "auto"
     if len(empty) <= settings.tolerance or (auto and left >= max(2, min(ENOUGH, (len(views) + 1) // 2))):
@@ -84,8 +84,8 @@ def check_silhouettes(
     if left >= 2 and not auto:
         remedy = f"set carving.hull.outside = 'auto', name only the other cameras in capture.toml, or {remedy}"
     raise GeometryError(
-        f"frame {frame}: the silhouette of camera {', '.join(empty)} is empty; check {cause}; where the subject is out "
-        f"of sight, {remedy}"
+        f"frame {frame}: the silhouette of camera {', '.join(empty)} is empty, or nearly so; check {cause}; where the "
+        f"subject is out of sight, {remedy}"
     )
 
 
@@ -136,7 +136,7 @@ def silhouette_coverage(views: PinholeViews, settings: HullSettings) -> np.ndarr
     cells, origin, edge = subject_cells(views, settings)
     centers, half = origin + (cells + 0.5) * edge, edge / 2
     C, H, W = views.masks.shape
-    share = np.ones(C)
+    share, blind = np.ones(C), views.blind()
     for c, (P, mask) in enumerate(zip(views.projections, views.masks, strict=True)):
         n = centers @ P[:, :3].T + P[:, 3]
         near = n[:, 2] - half * np.abs(P[2, :3]).sum()
@@ -152,7 +152,7 @@ def silhouette_coverage(views: PinholeViews, settings: HullSettings) -> np.ndarr
         np.add.at(corners, (low[:, 1], high[:, 0]), -1)
         np.add.at(corners, (high[:, 1], low[:, 0]), -1)
         covered = corners.cumsum(axis=0).cumsum(axis=1)[:H, :W] > 0
-        if mask.any():
+        if not blind[c]:
             share[c] = covered[mask != 0].mean()
     return share
 

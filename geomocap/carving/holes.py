@@ -45,7 +45,7 @@ def fill_false_holes(rig: Rig, views: PinholeViews, masks: list[np.ndarray]) -> 
     """
     result = list(masks)
     holes = [enclosed_holes(mask) for mask in masks]
-    if np.count_nonzero(~views.empty()) <= LEAST_OTHERS or not any(holes):
+    if np.count_nonzero(~views.blind()) <= LEAST_OTHERS or not any(holes):
         return result
     try:
         box = subject_box(views, ALL_BUT_ONE)

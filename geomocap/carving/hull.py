@@ -84,7 +84,7 @@ def heard(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.n
     unseen : (C,) bool
         What is outside the camera's view is unseen; for the others it is background.
     valid : (C, H, W) uint8
-        1 where the camera sees anything: with `outside = "auto"` nothing where the silhouette is empty.
+        1 where the camera sees anything: with `outside = "auto"` nothing where the silhouette is (nearly) empty.
     least : int
         Cameras that must have a say of a voxel.
     """
@@ -92,10 +92,10 @@ def heard(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.n
         return np.zeros(len(views), bool), views.valid, 0
     if settings.outside == "unseen":
         return np.ones(len(views), bool), views.valid, settings.views_of(len(views))
-    empty = views.empty()
-    unseen = views.cut_off() | empty
-    valid = np.where(empty[:, None, None], np.uint8(0), views.valid) if empty.any() else views.valid
-    return unseen, valid, settings.views_of(int((~empty).sum())) if unseen.any() else 0
+    blind = views.blind()
+    unseen = views.cut_off() | blind
+    valid = np.where(blind[:, None, None], np.uint8(0), views.valid) if blind.any() else views.valid
+    return unseen, valid, settings.views_of(int((~blind).sum())) if unseen.any() else 0
 
 
 def rounding_bounds(views: PinholeViews, grid: Grid) -> np.ndarray:

@@ -14,6 +14,7 @@ from geomocap.errors import CalibrationError
 
 BORDER = 3  # a silhouette that comes as near as this to the border of the image reaches it (pixels)
 LEAST_CUT = 3  # if so many of its pixels do
+SPECK = 0.01  # of the area that silhouettes have
 
 
 @dataclass(frozen=True)
@@ -81,9 +82,10 @@ class PinholeViews:
             cut[c] = np.count_nonzero(mask & (valid ^ within)) >= LEAST_CUT
         return cut
 
-    def empty(self) -> np.ndarray:
-        """Tell which cameras see nothing of the subject, (C,) bool."""
-        return np.array([not mask.any() for mask in self.masks])
+    def blind(self) -> np.ndarray:
+        """Tell which cameras see nothing of the subject, (C,) bool: nothing at all, or specks against other cameras."""
+        areas = np.array([np.count_nonzero(mask) for mask in self.masks])
+        return areas < max(SPECK * float(np.quantile(areas, 0.75)), 1.0)
 
     def without(self, camera: int) -> PinholeViews:
         """Return the views of all other cameras."""

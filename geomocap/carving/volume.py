@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import count
+from itertools import count as count_up
 
 import numpy as np
 
@@ -45,9 +45,13 @@ def working_volume(
         low, high = (np.array(corner, dtype=np.float64) for corner in settings.volume)
         return Grid.of_box(low, high, resolution=settings.resolution, voxel_size=settings.voxel_size)
     box: tuple[np.ndarray, np.ndarray] | None = None
-    longest = 0.0
-    for number, views in zip(count() if numbers is None else numbers, frames, strict=False):
+    longest, looked_at = 0.0, 0
+    blind: dict[str, int] = {}
+    for number, views in zip(count_up() if numbers is None else numbers, frames, strict=False):
         check_silhouettes(views, number, settings.hull)
+        looked_at += 1
+        for c in np.flatnonzero(views.blind()):
+            blind[views.names[c]] = blind.get(views.names[c], 0) + 1
         found = subject_box(views, settings.hull)
         if box is None or found is None:
             check_agreement(views, number, settings.hull)
@@ -57,6 +61,12 @@ def working_volume(
         box = found if box is None else (np.minimum(box[0], found[0]), np.maximum(box[1], found[1]))
     if box is None:
         raise GeometryError("no frames to find the working volume from; give `carving.volume`")
+    for name, count in blind.items():
+        if count == looked_at > settings.hull.tolerance:
+            raise GeometryError(
+                f"camera {name}: its silhouettes are empty, or nearly so, in all {looked_at} frames looked at; check "
+                "its images and background, or its masks, or name only the other cameras in capture.toml"
+            )
     # The subject counts, not how far it goes: a runner is measured as finely as somebody who stands
     edge = settings.voxel_size or (1 + 2 * settings.margin) * longest / settings.resolution
     margin = settings.margin * longest

@@ -94,9 +94,9 @@ class FrameViews:
         P[:, :2] -= 0.5 * P[:, 2:]
         levels = np.zeros((len(blurs_px), C, H, W), np.float32)
         wide = np.ones((2 * _MARGIN_PX + 1,) * 2, np.uint8)
-        allowed, empty = np.empty_like(views.masks), views.empty()  # an empty silhouette has no say
+        allowed, blind = np.empty_like(views.masks), views.blind()  # an empty silhouette has no say
         for c in range(C):
-            allowed[c] = cv2.dilate(views.masks[c], wide) | (views.valid[c] == 0) | empty[c]
+            allowed[c] = cv2.dilate(views.masks[c], wide) | (views.valid[c] == 0) | blind[c]
             _blur(images[c], views.masks[c], blurs_px, levels[:, c])
         low = voxels.indices.min(axis=0)
         top = voxels.indices.max(axis=0) + 1 - low

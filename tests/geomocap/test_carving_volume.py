@@ -172,8 +172,9 @@ def test_cameras_that_cut_the_subject_off_dont_cut_its_volume():
     lowered = P.copy()
     lowered[4, 1] -= 110 * P[4, 2]
     masks[3] = np.zeros_like(masks[3])
+    masks[3][40:45, 70:76] = 1  # a false blob
     views = PinholeViews.of(lowered, masks)
-    assert views.cut_off().nonzero()[0].tolist() == [1, 4, 6] and views.empty().nonzero()[0].tolist() == [3]
+    assert views.cut_off().nonzero()[0].tolist() == [1, 4, 6] and views.blind().nonzero()[0].tolist() == [3]
     grid = Grid.of_box(LOW - 0.2, HIGH + 0.2, resolution=96)
     cut, complete = visual_hull(views, grid), visual_hull(PinholeViews.of(P, whole), grid)
     rest = visual_hull(PinholeViews.of(P, whole).without(6).without(4).without(3).without(1), grid)
@@ -209,7 +210,10 @@ def test_an_empty_silhouette_comes_with_advice_that_can_be_followed():
     with pytest.raises(GeometryError, match=rf"check masks/{views.names[1]}/000003\.png \(expected: 255"):
         check_silhouettes(views, 3, strict, given)
     allowed = CarvingSettings(resolution=32)
-    assert len(carve_frame(views, working_volume([views], allowed), allowed, frame=3).indices) > 100
+    grid = working_volume([figure(ring(4)), views], allowed)
+    assert len(carve_frame(views, grid, allowed, frame=3).indices) > 100
+    with pytest.raises(GeometryError, match=r"camera cam1: its silhouettes are empty, or nearly so, in all 1 frames"):
+        working_volume([views], allowed)
     views.masks[:3] = 0
     with pytest.raises(GeometryError, match=r"out of sight, name the frames that show it in capture\.toml"):
         check_silhouettes(views, 3, HullSettings())
