@@ -15,6 +15,7 @@ from geomocap.carving.views import PinholeViews
 from geomocap.errors import GeometryError
 
 MOST_VOXELS = 1 << 30  # one bit each: 128 MB; a longer way than this is carved more coarsely
+MOST_STRETCHED = 1.5  # times its median length: the longest that a subject is taken for
 
 _DEFAULT = CarvingSettings()
 
@@ -45,7 +46,8 @@ def working_volume(
         low, high = (np.array(corner, dtype=np.float64) for corner in settings.volume)
         return Grid.of_box(low, high, resolution=settings.resolution, voxel_size=settings.voxel_size)
     box: tuple[np.ndarray, np.ndarray] | None = None
-    longest, looked_at = 0.0, 0
+    lengths: list[float] = []
+    looked_at = 0
     blind: dict[str, int] = {}
     for number, views in zip(count_up() if numbers is None else numbers, frames, strict=False):
         check_silhouettes(views, number, settings.hull)
@@ -57,7 +59,7 @@ def working_volume(
             check_agreement(views, number, settings.hull)
         if found is None:
             continue
-        longest = max(longest, float((found[1] - found[0]).max()))
+        lengths.append(float((found[1] - found[0]).max()))
         box = found if box is None else (np.minimum(box[0], found[0]), np.maximum(box[1], found[1]))
     if box is None:
         raise GeometryError("no frames to find the working volume from; give `carving.volume`")
@@ -67,6 +69,8 @@ def working_volume(
                 f"camera {name}: its silhouettes are empty, or nearly so, in all {looked_at} frames looked at; check "
                 "its images and background, or its masks, or name only the other cameras in capture.toml"
             )
+    # A frame in which cameras see little leaves room for more than the subject
+    longest = min(max(lengths), MOST_STRETCHED * float(np.median(lengths)))
     # The subject counts, not how far it goes: a runner is measured as finely as somebody who stands
     edge = settings.voxel_size or (1 + 2 * settings.margin) * longest / settings.resolution
     margin = settings.margin * longest

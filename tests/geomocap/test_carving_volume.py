@@ -237,3 +237,13 @@ def test_subject_outside_the_volume():
     voxels = carve_frame(views, whole)
     np.testing.assert_array_equal(voxels.indices, hull_surface(views, whole))
     assert visual_hull(views, whole)[tuple(voxels.indices.T)].all() and (voxels.colors == voxels.colors[0, 0]).all()
+
+
+def test_a_frame_that_leaves_much_room_doesnt_make_all_frames_coarse():
+    P = ring(8, radius=9)
+    whole, bulky = (PinholeViews.of(P, silhouettes(P, scale * FIGURE)) for scale in (1.0, 2.0))
+    low, high = subject_box(bulky, HullSettings())
+    settings = CarvingSettings(resolution=64, margin=0)
+    alone, together = (working_volume(frames, settings) for frames in ([whole] * 3, [whole, whole, bulky]))
+    assert together.voxel_size == pytest.approx(1.5 * alone.voxel_size)
+    assert (together.low <= low + 1e-9).all() and (together.high >= high - 1e-9).all()
