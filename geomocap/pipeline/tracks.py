@@ -50,8 +50,12 @@ def tracks(job: Job) -> str:
 def _track(job: Job, capture: Capture) -> int:
     read = frame_reader(capture, job.run, job.config.tracking)
     found = track_surface(read, capture.n_frames, job.config.tracking, job.progress, job.executor)
-    motion = smooth_motion(found.positions, job.fps, found.sigma, job.config.smoothing)
-    filtered = filter_trajectories(found, motion, job.config.filters)
+    unfiltered = found.positions.astype(np.float32)
+    # nothing is held longer than it is needed: long recordings have many trajectories
+    filtered = filter_trajectories(
+        found, smooth_motion(found.positions, job.fps, found.sigma, job.config.smoothing), job.config.filters
+    )
+    del found
     kept = filtered.trajectories
     motion = smooth_motion(kept.positions, job.fps, kept.sigma, job.config.smoothing)
     job.run.write_npz(
@@ -72,7 +76,7 @@ def _track(job: Job, capture: Capture) -> int:
         begin_reason=kept.begin_reason,
         end_reason=kept.end_reason,
         reasons=list(REASONS),
-        unfiltered=found.positions.astype(np.float32),
+        unfiltered=unfiltered,
         kept=filtered.kept,
     )
     return capture.n_frames

@@ -121,8 +121,9 @@ def departure(tracks: Trajectories, window: int) -> np.ndarray:
     """
     N, T = tracks.positions.shape[:2]
     out = np.full((N, T), np.nan)
+    measured = tracks.measured
     for t in range(window, T):
-        rows = np.flatnonzero(tracks.measured[:, t] & tracks.measured[:, t - window])
+        rows = np.flatnonzero(measured[:, t] & measured[:, t - window])
         if len(rows) <= _NEIGHBOURS:
             continue
         old, new = tracks.positions[rows, t - window], tracks.positions[rows, t]
