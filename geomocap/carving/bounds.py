@@ -107,9 +107,9 @@ def halve(
 
 def _tables(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Integral images of the silhouettes and of what is seen, where the outside is unseen, cameras with a say."""
+    views, unseen, least = heard(views, settings)
     subject = summed(views.masks)
-    unseen, valid, least = heard(views, settings)
-    return subject, summed(valid) if unseen.any() else subject, unseen, least
+    return subject, summed(views.valid) if unseen.any() else subject, unseen, least
 
 
 def _connected(cells: np.ndarray) -> np.ndarray:

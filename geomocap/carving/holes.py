@@ -56,8 +56,10 @@ def fill_false_holes(rig: Rig, views: PinholeViews, masks: list[np.ndarray]) -> 
     grid = Grid.of_box(*box, resolution=RESOLUTION)
     occupied = hull(views, grid, ALL_BUT_ONE).indices()
     dissent = np.full(grid.shape, EMPTY, np.int8)
-    unseen, valid, _ = heard(views, ALL_BUT_ONE)
-    _find_dissent(views.projections, views.masks, valid, unseen, occupied, grid.origin, grid.voxel_size, dissent)
+    heeded, unseen, _ = heard(views, ALL_BUT_ONE)
+    _find_dissent(
+        views.projections, heeded.masks, heeded.valid, unseen, occupied, grid.origin, grid.voxel_size, dissent
+    )
     for c, mask in enumerate(masks):
         filled = mask.copy()
         for inside, rim in holes[c]:

@@ -30,15 +30,15 @@ def hull(views: PinholeViews, grid: Grid, settings: HullSettings = _DEFAULT) -> 
     Szeliski, Rapid octree construction from image sequences, CVGIP: Image Understanding 58(1), 1993; the integral
     images are Crow's summed-area tables (SIGGRAPH 1984).
     """
-    unseen, valid, least = heard(views, settings)
+    views, unseen, least = heard(views, settings)
     occupancy = Occupancy.empty(grid.shape)
     subject = summed(views.masks)
-    seen = summed(valid) if unseen.any() else subject
+    seen = summed(views.valid) if unseen.any() else subject
     carve(
         views.projections,
         rounding_bounds(views, grid),
         views.masks,
-        valid,
+        views.valid,
         subject,
         seen,
         unseen,
@@ -76,26 +76,28 @@ def hull_surface(views: PinholeViews, grid: Grid, settings: HullSettings = _DEFA
     return hull(views, grid, settings).surface_indices()
 
 
-def heard(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.ndarray, int]:
+def heard(views: PinholeViews, settings: HullSettings) -> tuple[PinholeViews, np.ndarray, int]:
     """Tell of what each camera has a say.
 
     Returns
     -------
+    PinholeViews
+        With `outside = "auto"` a camera whose silhouette is (nearly) empty sees nothing at all.
     unseen : (C,) bool
         What is outside the camera's view is unseen; for the others it is background.
-    valid : (C, H, W) uint8
-        1 where the camera sees anything: with `outside = "auto"` nothing where the silhouette is (nearly) empty.
     least : int
         Cameras that must have a say of a voxel.
     """
     if settings.outside == "empty":
-        return np.zeros(len(views), bool), views.valid, 0
+        return views, np.zeros(len(views), bool), 0
     if settings.outside == "unseen":
-        return np.ones(len(views), bool), views.valid, settings.views_of(len(views))
+        return views, np.ones(len(views), bool), settings.views_of(len(views))
     blind = views.blind()
     unseen = views.cut_off() | blind
-    valid = np.where(blind[:, None, None], np.uint8(0), views.valid) if blind.any() else views.valid
-    return unseen, valid, settings.views_of(int((~blind).sum())) if unseen.any() else 0
+    if blind.any():
+        masks, valid = (np.where(blind[:, None, None], np.uint8(0), m) for m in (views.masks, views.valid))
+        views = PinholeViews(views.names, views.projections, masks, valid)
+    return views, unseen, settings.views_of(int((~blind).sum())) if unseen.any() else 0
 
 
 def rounding_bounds(views: PinholeViews, grid: Grid) -> np.ndarray:
