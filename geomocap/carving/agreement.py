@@ -15,9 +15,9 @@ from geomocap.carving.views import PinholeViews
 from geomocap.errors import CalibrationError, GeometryError
 
 LOW_COVERAGE = 0.5  # silhouettes of which half the cameras explain less than this are suspicious
+CLEAR_GAIN = 0.3  # and a camera is to blame if without it the others' coverage is that much higher
 ENOUGH = 4  # cameras that see the subject enclose it, however many others there are
 ALL = HullSettings(outside="empty")  # a point counts where all cameras see it
-CLEAR_GAIN = 0.3  # and a camera is to blame if without it the others' coverage is that much higher
 
 
 def check_cameras(views: PinholeViews, settings: HullSettings) -> None:

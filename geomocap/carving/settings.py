@@ -18,7 +18,7 @@ class HullSettings(Settings):
         default="auto",
         description="what a voxel outside a camera's view is for that camera: empty: background, as in the paper; "
         "unseen: that camera has no say; auto: unseen in the frames in which the camera's silhouette is cut off by the "
-        "image's border; a camera whose silhouette is empty has no say at all in that frame",
+        "image's border; a camera whose silhouette is (nearly) empty has no say at all in that frame",
     )
     min_views: int = Field(
         default=0,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import count as count_up
+from itertools import count
 
 import numpy as np
 
@@ -49,7 +49,7 @@ def working_volume(
     lengths: list[float] = []
     looked_at = 0
     blind: dict[str, int] = {}
-    for number, views in zip(count_up() if numbers is None else numbers, frames, strict=False):
+    for number, views in zip(count() if numbers is None else numbers, frames, strict=False):
         check_silhouettes(views, number, settings.hull)
         looked_at += 1
         for c in np.flatnonzero(views.blind()):
@@ -63,8 +63,8 @@ def working_volume(
         box = found if box is None else (np.minimum(box[0], found[0]), np.maximum(box[1], found[1]))
     if box is None:
         raise GeometryError("no frames to find the working volume from; give `carving.volume`")
-    for name, count in blind.items():
-        if count == looked_at > settings.hull.tolerance:
+    for name, frames_without in blind.items():
+        if frames_without == looked_at > settings.hull.tolerance:
             raise GeometryError(
                 f"camera {name}: its silhouettes are empty, or nearly so, in all {looked_at} frames looked at; check "
                 "its images and background, or its masks, or name only the other cameras in capture.toml"

@@ -68,7 +68,7 @@ def bounds_of(capture: Capture, settings: CloudSettings) -> Bounds:
     if settings.bounds != "auto":
         return settings.bounds
     plates = all(capture.has_background(c) for c in capture.cameras)
-    if not (capture.has_masks or plates or capture.n_frames >= BACKGROUND_FRAMES):
+    if not (capture.has_masks or plates or capture.n_recorded >= BACKGROUND_FRAMES):
         return "none"
     return "hull" if len(capture.cameras) >= HULL_CAMERAS else "silhouettes"
 
