@@ -13,7 +13,7 @@ import shutil
 import threading
 import time
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -89,8 +89,8 @@ class Run:
 
         write_atomic(self.path / name, write)
 
-    def read_npz(self, name: str) -> dict[str, np.ndarray]:
-        """Read an NPZ file of the run, never executing anything in it.
+    def read_npz(self, name: str, only: Collection[str] = ()) -> dict[str, np.ndarray]:
+        """Read an NPZ file of the run, never executing anything in it; of its arrays those named in `only`, if any are.
 
         Raises
         ------
@@ -100,7 +100,7 @@ class Run:
         file = self.path / name
         try:
             with file.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
-                return dict(data)
+                return {key: data[key] for key in data.files if not only or key in only}
         except FileNotFoundError:
             raise RunError(f"{file}: missing; run the stage that writes it") from None
         except Exception as error:

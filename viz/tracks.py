@@ -54,7 +54,7 @@ def read_tracks(results: Results) -> Tracks | None:
     """
     if not (results.run.path / "tracks.npz").exists():
         return None
-    found = results.run.read_npz("tracks.npz")
+    found = results.run.read_npz("tracks.npz", ("positions", "velocities", "unfiltered", "kept"))
     if not {"positions", "velocities"} <= set(found):
         raise RunError(
             f"{results.run.path / 'tracks.npz'}: has no positions and velocities; run `geomocap track` again"

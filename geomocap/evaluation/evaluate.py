@@ -91,7 +91,7 @@ def evaluate_synthetic(
         parts.append(judge_skeleton(skeleton, truth, votes))
     progress("evaluate", 4, 5)
     if (run.path / "tracks.npz").is_file():
-        parts.append(judge_tracks(run.read_npz("tracks.npz")["positions"], truth))
+        parts.append(judge_tracks(run.read_npz("tracks.npz", ["positions"])["positions"], truth))
     progress("evaluate", 5, 5)
     figures: dict[str, float] = {"truth.bodies": len(truth.bodies), "truth.height_m": round(truth.height, 3)}
     for part in parts:

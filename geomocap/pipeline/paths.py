@@ -12,6 +12,7 @@ from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.tracking.nodes import track_nodes
 from geomocap.tracking.selection import spread_out
 
+OF_TRACKS = ("positions", "sigma", "sight")  # what motion paths are made from
 SAMPLES = 2000  # motion paths that bodies are found from
 ALONE_SHARE = 0.5  # of the standard deviation of what a single camera sees, as most of that is depth and hardly counts
 LEAST_SAMPLES = 300  # fewer long trajectories than these don't cover a subject: nodes are tracked instead
@@ -40,7 +41,7 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> tuple[Motion
         settings = job.config.segmentation
         found = ellipsoid_paths(geometry.points, len(geometry), geometry.spacing, settings, job.executor, job.progress)
         return MotionPaths(found.ellipsoids.centers.swapaxes(0, 1)), wanted
-    tracked = job.run.read_npz("tracks.npz") if has_tracks else None
+    tracked = job.run.read_npz("tracks.npz", OF_TRACKS) if has_tracks else None
     if tracked is not None and wanted != "both":
         paths = patch_paths(tracked)
         if paths is not None and (wanted == "patches" or _covers(paths)):

@@ -15,7 +15,7 @@ from geomocap.files import fingerprint
 from geomocap.geometry import BodyPoints, Geometry
 from geomocap.pipeline.derived import FROM_BODIES
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.paths import patch_paths
+from geomocap.pipeline.paths import OF_TRACKS, patch_paths
 from geomocap.pipeline.tracks import tracks
 from geomocap.pipeline.warnings import WARNINGS_FILE, write_warnings
 from geomocap.run import Run, stage_key
@@ -54,7 +54,7 @@ def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) ->
             frames,
             geometry.spacing,
             job.up_axis,
-            patch_paths(job.run.read_npz("tracks.npz")) if patches else None,
+            patch_paths(job.run.read_npz("tracks.npz", OF_TRACKS)) if patches else None,
             job.config.take,
             job.progress,
         )

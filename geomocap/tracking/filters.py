@@ -93,12 +93,18 @@ def filter_trajectories(tracks: Trajectories, motion: Motion, settings: FilterSe
             (UNLIKE, away > unlike),
         )
     cut = {}
+    left, end, begin = tracks.measured, tracks.end_reason, tracks.begin_reason
     for reason, bad in tests:
-        tracks, count = _truncate(tracks, bad & tracks.measured, reason)
-        cut[REASONS[reason]] = count
-    kept = np.flatnonzero(tracks.lengths >= settings.least_frames)
+        after, before = _beyond(bad & left, tracks.placed)
+        left = left & ~(after | before)
+        end = np.where(after.any(axis=1), reason, end)
+        begin = np.where(before.any(axis=1), reason, begin)
+        cut[REASONS[reason]] = int((after | before).any(axis=1).sum())
+    kept = np.flatnonzero(left.sum(axis=1) >= settings.least_frames)
     cut[REASONS[TOO_SHORT]] = len(tracks) - len(kept)
-    return Filtered(tracks.select(kept), kept, cut, fastest, acceleration, unlike)
+    rest = replace(tracks, end_reason=end, begin_reason=begin).select(kept)
+    rest.clear(~left[kept])
+    return Filtered(rest, kept, cut, fastest, acceleration, unlike)
 
 
 def departure(tracks: Trajectories, window: int) -> np.ndarray:
@@ -143,17 +149,9 @@ def _limit(values: np.ndarray, share: float, factor: float) -> float:
     return factor * float(np.quantile(known, share)) if len(known) else float("inf")
 
 
-def _truncate(tracks: Trajectories, bad: np.ndarray, reason: int) -> tuple[Trajectories, int]:
-    """Cut what lies beyond bad frames, seen from the frame of placing; return how many trajectories were cut."""
-    frames = np.arange(tracks.n_frames)
-    after = frames[None] >= tracks.placed[:, None]
+def _beyond(bad: np.ndarray, placed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find what lies beyond bad frames, (N, T) bool, seen from the frame of placing (N,): after it, and before it."""
+    after = np.arange(bad.shape[1])[None] >= placed[:, None]
     behind = np.logical_or.accumulate(bad & after, axis=1)
     before = np.logical_or.accumulate((bad & ~after)[:, ::-1], axis=1)[:, ::-1]
-    drop = behind | before
-    cut_after, cut_before = behind.any(axis=1), before.any(axis=1)
-    rest = replace(
-        tracks.without(drop),
-        end_reason=np.where(cut_after, reason, tracks.end_reason),
-        begin_reason=np.where(cut_before, reason, tracks.begin_reason),
-    )
-    return rest, int((cut_after | cut_before).sum())
+    return behind, before

@@ -21,11 +21,14 @@ def join_broken(tracks: Trajectories) -> Trajectories:
     have (at least three) it stays where it is in the patch frame of the other; its further frames go over to the
     other, carried by its shift and turn. Those that add most go first. The standard deviation of what was taken over
     has that of the relative place added.
+
+    The arrays of `tracks` are worked on in place, as those of a long recording fill the memory: it is of no use
+    afterwards.
     """
     if not len(tracks):
         return tracks
     typical = _typical_distance(tracks)
-    arrays = {f.name: np.array(getattr(tracks, f.name)) for f in fields(tracks)}
+    arrays = {f.name: getattr(tracks, f.name) for f in fields(tracks)}
     measured = tracks.measured
     alive = np.ones(len(tracks), bool)
     pairs = _near_pairs(tracks, _NEAR * typical)
@@ -59,7 +62,7 @@ def join_broken(tracks: Trajectories) -> Trajectories:
             arrays["end_reason"][i] = arrays["end_reason"][j]
         if len(ends) and ends[0] < np.flatnonzero(has)[0]:
             arrays["begin_reason"][i] = arrays["begin_reason"][j]
-    return Trajectories(**arrays).select(alive)
+    return tracks.select(alive)
 
 
 def _typical_distance(tracks: Trajectories) -> float:

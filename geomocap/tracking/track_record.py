@@ -84,9 +84,11 @@ class TrackRecord:
     def trajectories(self, count: int) -> Trajectories:
         """Return all `count` trajectories."""
         T = self.n_frames
-        positions, rotations = np.full((count, T, 3), np.nan), np.full((count, T, 3, 3), np.nan)
-        sigma, correlation = np.full((count, T), np.nan), np.full((count, T), np.nan)
-        n_views, sight = np.zeros((count, T), int), np.zeros((count, T, 3))
+        # all but the positions in single precision: long recordings have many trajectories, each with all frames
+        positions = np.full((count, T, 3), np.nan)
+        rotations = np.full((count, T, 3, 3), np.nan, np.float32)
+        sigma, correlation = np.full((count, T), np.nan, np.float32), np.full((count, T), np.nan, np.float32)
+        n_views, sight = np.zeros((count, T), np.int16), np.zeros((count, T, 3), np.float32)
         first, placed = np.zeros((count, 3, 3)), np.zeros(count, int)
         for frame, identity, frames in self._placed:
             first[identity], placed[identity] = frames, frame

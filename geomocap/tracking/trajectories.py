@@ -119,20 +119,12 @@ class Trajectories:
         """Return some of them, by a mask or by positions."""
         return Trajectories(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
-    def without(self, drop: np.ndarray) -> Trajectories:
-        """Return them without the positions where `drop` (N, T) is true."""
-        return Trajectories(
-            np.where(drop[:, :, None], np.nan, self.positions),
-            np.where(drop[:, :, None, None], np.nan, self.rotations),
-            np.where(drop, np.nan, self.sigma),
-            np.where(drop, np.nan, self.correlation),
-            np.where(drop, 0, self.n_views),
-            np.where(drop[:, :, None], 0.0, self.sight),
-            self.normals,
-            self.placed,
-            self.end_reason,
-            self.begin_reason,
-        )
+    def clear(self, drop: np.ndarray) -> None:
+        """Take away, in place, what was measured where `drop` (N, T) is true."""
+        for values in (self.positions, self.rotations, self.sigma, self.correlation):
+            values[drop] = np.nan
+        for values in (self.n_views, self.sight):
+            values[drop] = 0
 
     def reasons(self) -> dict[str, int]:
         """Count why the trajectories end."""

@@ -76,6 +76,13 @@ def test_key_depends_on_everything():
     assert stage_key("a", {"x": 1, "y": 2}) == stage_key("a", {"y": 2, "x": 1})
 
 
+def test_of_an_npz_file_what_is_named_is_read(tmp_path):
+    run = Run(tmp_path)
+    run.write_npz("some.npz", x=np.arange(3), y=np.arange(4))
+    assert set(run.read_npz("some.npz")) == {"x", "y"}
+    assert set(run.read_npz("some.npz", ("y", "z"))) == {"y"}
+
+
 def test_npz_is_never_executed(tmp_path):
     run = Run(tmp_path)
     np.savez(tmp_path / "bad.npz", x=np.array([{"a": 1}], dtype=object))

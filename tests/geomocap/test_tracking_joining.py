@@ -40,7 +40,9 @@ def cut(tracks, *spans):
     drop = np.ones((len(tracks), T), bool)
     for row, (low, high) in enumerate(spans):
         drop[row, low:high] = False
-    return tracks.without(drop)
+    tracks = tracks.select(np.arange(len(tracks)))
+    tracks.clear(drop)
+    return tracks
 
 
 GRID = [[0.02 * i, 0.02 * j, 0.0] for i in range(4) for j in range(3)]

@@ -76,7 +76,8 @@ def test_what_several_cameras_see_stays(scene):
     some[::2] = 0
     positions = tracks.positions.copy()
     positions[5, 3:6] = np.nan
-    gaps = tracks.without(np.isnan(positions[:, :, 0]))
+    gaps = tracks.select(np.arange(len(tracks)))
+    gaps.clear(np.isnan(positions[:, :, 0]))
     some[np.isnan(positions[:, :, 0])] = 0
     adjusted = adjust_depths(replace(gaps, sight=some))
     assert_allclose(adjusted.positions[::2], gaps.positions[::2])

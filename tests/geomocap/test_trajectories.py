@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from geomocap.errors import GeometryError
 from geomocap.tracking.filters import FilterSettings, departure, filter_trajectories
@@ -26,6 +26,20 @@ def test_starts_ends_and_lengths_skip_gaps():
     assert tracks.end.tolist() == [5, 3, -1]
     assert tracks.lengths.tolist() == [4, 4, 0]
     assert tracks.reasons() == {"followed to the last frame": 3}
+
+
+def test_what_is_cleared_is_gone_and_only_there():
+    tracks = make_tracks(np.ones((2, 4, 3)))
+    kept = tracks.select(np.arange(2))
+    drop = np.zeros((2, 4), bool)
+    drop[1, 2:] = True
+    tracks.clear(drop)
+    assert tracks.lengths.tolist() == [4, 2]
+    for values in (tracks.positions, tracks.rotations, tracks.sigma, tracks.correlation):
+        assert np.isnan(values[drop]).all()
+    assert not tracks.n_views[drop].any() and not tracks.sight[drop].any()
+    assert_array_equal(tracks.positions[~drop], kept.positions[~drop])
+    assert kept.lengths.tolist() == [4, 4]  # a selection is a copy
 
 
 def test_shapes_are_checked():
