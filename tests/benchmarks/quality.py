@@ -16,14 +16,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
-import numpy as np
-
 from data_tools.asset import AnimatedAsset
 from data_tools.figure import figure, mechanism
 from data_tools.gltf import load_gltf
 from data_tools.synthesize import SynthesisSettings, synthesize
-from geomocap.capture import Capture
+from tests.benchmarks.changes import crop, different_cameras, give_silhouettes, reverse
 from tests.benchmarks.creatures import fan, runner, snake, spider
 
 DATA = Path(os.environ.get("GEOMOCAP_DATA", "."))
@@ -59,55 +56,12 @@ class Case:
     flags: tuple[str, ...] = ()
 
 
-def give_silhouettes(grow: int) -> Callable[[Path, Path], None]:
-    """Give the capture the true silhouettes, `grow` pixels too large (or, if negative, too small)."""
-
-    def change(capture: Path, truth: Path) -> None:
-        work = cv2.dilate if grow > 0 else cv2.erode
-        for file in sorted((truth / "masks").rglob("*.png")):
-            mask = work(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), np.ones((3, 3), np.uint8), iterations=abs(grow))
-            target = capture / file.relative_to(truth)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(target), mask)
-
-    return change
-
-
-def reverse(capture: Path, truth: Path) -> None:
-    """Let capture and truth run backwards."""
-    for folder in (*(capture / "images").iterdir(), *(truth / "masks").iterdir()):
-        files = sorted(folder.glob("*.png"))
-        kept = [f.rename(f.with_suffix(".kept")) for f in files]
-        for file, old in zip(files, reversed(kept), strict=True):
-            old.rename(file)
-    with np.load(truth / "truth.npz") as loaded:
-        arrays = dict(loaded)
-    T = len(arrays["vertices"])
-    moving = ("vertices", "joint_positions", "joint_rotations")
-    assert all(len(arrays[name]) == T for name in moving)
-    np.savez_compressed(truth / "truth.npz", **{k: v[::-1] if k in moving else v for k, v in arrays.items()})
-
-
-def crop(capture: Path, truth: Path) -> None:
-    """Let three of the cameras see a part of the subject only: cut off the feet, the head, the right half."""
-    windows = {1: (slice(0, 300), slice(None)), 4: (slice(190, None), slice(None)), 6: (slice(None), slice(0, 330))}
-    opened = Capture.open(capture)
-    rig, names = opened.rig, opened.cameras
-    for c, (rows, columns) in windows.items():
-        for file in (*(capture / "images" / names[c]).glob("*.png"), capture / "background" / f"{names[c]}.png"):
-            cv2.imwrite(str(file), cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[rows, columns])
-        image = cv2.imread(str(capture / "images" / names[c] / "000000.png"))
-        camera = rig.cameras[c]
-        camera.principal_point_y -= rows.start or 0
-        camera.height, camera.width = image.shape[:2]
-    rig.write(capture / "sparse")
-
-
 CASES = {
     "man walking, 30 fps": Case(man),
     "the same, 15 fps": Case(man, {"fps": 15}),
     "5 cameras": Case(man, {"cameras": 5}),
     "three of 8 cameras see a part of him only": Case(man, change=crop),
+    "five lens models, four sizes, noise, lossy images and videos": Case(man, change=different_cameras),
     "half the texture contrast": Case(man, {"texture_contrast": 0.14}),
     "silhouettes given, eroded by a pixel": Case(man, change=give_silhouettes(-1)),
     "dilated by a pixel": Case(man, change=give_silhouettes(1)),
@@ -179,9 +133,7 @@ HEAD = (
 def main() -> None:
     if len(sys.argv) < 2:
         sys.exit(__doc__)
-    print(
-        "| capture | bodies found / true | ARI | core ARI | joints recall 5 % / precision | error (mm) | edges, false |"
-    )
+    print(HEAD)
     for name in sys.argv[2:] or CASES:
         print(row(name, measure(name, Path(sys.argv[1]))), flush=True)
 
