@@ -15,20 +15,23 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import open3d as o3d
-import trimesh
 from pydantic import Field
 from scipy.spatial import cKDTree
 
 from geomocap.errors import GeometryError
 from geomocap.files import fingerprint
-from geomocap.geometry import Voxels
-from geomocap.open3d_files import check_ply, read_by_open3d
+from geomocap.scan_files import (
+    ARRAY_ENDINGS,
+    CLOUD_ENDINGS,
+    MESH_ENDINGS,
+    Places,
+    Surface,
+    places_on,
+    read_array,
+    read_surface,
+)
 from geomocap.settings import Settings
 
-MESH_ENDINGS = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
-CLOUD_ENDINGS = (".ply", ".pcd", ".xyz", ".pts")
-ARRAY_ENDINGS = (".npz", ".npy")
 _FARTHEST = 1e5  # extents from the origin; ten times farther the equations of motion lose their last digits
 
 
@@ -55,13 +58,13 @@ class Scans:
     names : tuple of str
         What each frame came from.
     read : callable
-        `read(frame) -> (N, 3) float`, metres.
+        `read(frame) -> Surface`, scan units.
     settings : ScanSettings
     """
 
     source: Path
     names: tuple[str, ...]
-    read: Callable[[int], np.ndarray]
+    read: Callable[[int], Surface]
     settings: ScanSettings
 
     features = None
@@ -70,7 +73,20 @@ class Scans:
         return len(self.names)
 
     def points(self, frame: int) -> np.ndarray:
-        """Return the points of one frame, (N, 3) float, metres, without those that are NaN.
+        """Return the points of one frame, (N, 3) float, metres, without those that are NaN; of a mesh, samples.
+
+        Raises
+        ------
+        GeometryError
+            As `surface` does.
+        """
+        surface = self.surface(frame)
+        if surface.faces is None:
+            return surface.points[~np.isnan(surface.points).any(axis=1)]
+        return self.places(surface, frame).of(surface.points)
+
+    def surface(self, frame: int) -> Surface:
+        """Return what the scan of one frame holds, metres.
 
         Raises
         ------
@@ -79,7 +95,8 @@ class Scans:
             far from the origin for their extent.
         """
         name = self.names[frame]
-        points = np.ascontiguousarray(self.read(frame), dtype=np.float64) * self.settings.scale
+        surface = self.read(frame).scaled(self.settings.scale)
+        points = surface.points
         if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
             raise GeometryError(f"{name}: expected points of shape (N, 3), got {points.shape}")
         missing = np.isnan(points).any(axis=1)
@@ -96,7 +113,20 @@ class Scans:
                 f"{name}: points lie {away / extent:.1e} times their extent from the origin, over {_FARTHEST:.0e}: "
                 "motions would get lost in rounding; subtract the same offset from all scans"
             )
-        return points
+        return surface
+
+    def places(self, mesh: Surface, frame: int) -> Places:
+        """Choose the places on a frame's mesh at which it is sampled.
+
+        Raises
+        ------
+        GeometryError
+            If it has no area.
+        """
+        try:
+            return places_on(mesh, self.settings.samples, self.settings.seed)
+        except GeometryError as error:
+            raise GeometryError(f"{self.names[frame]}: {error}") from None
 
     @cached_property
     def spacing(self) -> float:
@@ -132,87 +162,17 @@ def open_scans(source: Path, settings: ScanSettings) -> Scans:
     source = Path(source)
     if source.is_dir():
         files = _sequence(source)
-        return Scans(source, tuple(str(f) for f in files), lambda k: read_points(files[k], settings), settings)
+        return Scans(source, tuple(str(f) for f in files), lambda k: read_surface(files[k]), settings)
     if not source.is_file():
         raise GeometryError(f"{source}: no such file or folder of scans")
     if source.suffix.lower() in ARRAY_ENDINGS:
-        array = _read_array(source)
+        array = read_array(source)
         frames = array if array.ndim == 3 else array[None]
         if not len(frames):
             raise GeometryError(f"{source}: holds no frames; expected points of shape (T, N, 3), got {array.shape}")
         names = tuple(f"{source}, frame {k}" for k in range(len(frames)))
-        return Scans(source, names, lambda k: frames[k], settings)
-    return Scans(source, (str(source),), lambda _: read_points(source, settings), settings)
-
-
-def read_points(path: Path, settings: ScanSettings) -> np.ndarray:
-    """Read a scan as points (N, 3): vertices of clouds, centres of voxels, samples of a mesh's surface."""
-    suffix = path.suffix.lower()
-    if suffix in ARRAY_ENDINGS:
-        return _read_array(path)
-    if suffix == ".ply":
-        check_ply(path)
-        if _is_voxel_grid(path):
-            return Voxels.read(path).points
-    try:
-        if suffix in MESH_ENDINGS:
-            mesh = trimesh.load(path, process=False, force="mesh")
-            if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-                return _sample(mesh, settings)
-        cloud = read_by_open3d(o3d.io.read_point_cloud, path) if suffix in CLOUD_ENDINGS else None
-    except Exception as error:
-        raise GeometryError(f"{path}: can't be read as a scan ({str(error).splitlines()[0]})") from None
-    if cloud is None or not cloud.has_points():
-        raise GeometryError(f"{path}: holds neither triangles nor points; is it whole?")
-    return np.asarray(cloud.points)
-
-
-def _sample(mesh: trimesh.Trimesh, settings: ScanSettings) -> np.ndarray:
-    """Sample a surface evenly by area: stratified over the triangles in their order, seeded."""
-    rng = np.random.default_rng(settings.seed)
-    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
-    if np.isinf(vertices).any():
-        raise GeometryError("it has infinite vertices; remove them")
-    faces = faces[~np.isnan(vertices[faces]).any(axis=(1, 2))]
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    if not area.sum() > 0:
-        raise GeometryError("the mesh has no area; is it whole?")
-    steps = (np.arange(settings.samples) + rng.random(settings.samples)) / settings.samples
-    face = np.minimum(np.searchsorted(np.cumsum(area) / area.sum(), steps), len(faces) - 1)
-    u, v = rng.random((2, settings.samples))
-    flip = u + v > 1
-    u[flip], v[flip] = 1 - u[flip], 1 - v[flip]
-    return a[face] + u[:, None] * (b - a)[face] + v[:, None] * (c - a)[face]
-
-
-def _read_array(path: Path) -> np.ndarray:
-    try:
-        data = np.load(path, allow_pickle=False)
-        if isinstance(data, np.ndarray):
-            array = data
-        else:
-            with data:
-                name = next((n for n in ("points", "positions", "vertices") if n in data.files), None)
-                if name is None:
-                    raise GeometryError(
-                        f"{path}: expected an array `points` of shape (N, 3) or (T, N, 3); "
-                        f"it has {', '.join(data.files)}"
-                    )
-                array = data[name]
-    except (OSError, ValueError, EOFError) as error:
-        raise GeometryError(f"{path}: can't be read as plain arrays ({error})") from None
-    if array.ndim not in (2, 3) or array.shape[-1] != 3 or array.dtype.kind not in "fiu":
-        raise GeometryError(
-            f"{path}: expected numbers of shape (N, 3) or (T, N, 3), got {array.dtype} of shape {array.shape}"
-        )
-    return array.astype(np.float64)
-
-
-def _is_voxel_grid(path: Path) -> bool:
-    with path.open("rb") as file:
-        header = file.read(2048)
-    return b"element origin" in header or b"voxel_size" in header
+        return Scans(source, names, lambda k: Surface(frames[k]), settings)
+    return Scans(source, (str(source),), lambda _: read_surface(source), settings)
 
 
 def _sequence(folder: Path) -> list[Path]:

@@ -38,6 +38,7 @@ from viz.views import Stage
 
 _FOLLOWED = {
     "patches": "patches of the images",
+    "points": "points that the scans have in common",
     "nodes": "nodes of a deformable surface",
     "both": "nodes of a deformable surface, held by patches of the images",
     "ellipsoids": "ellipsoids",

@@ -7,6 +7,8 @@ import numpy as np
 from geomocap.errors import GeometryError
 from geomocap.geometry import Geometry
 from geomocap.pipeline.job import Job
+from geomocap.scan_tracks import scan_tracks
+from geomocap.scans import Scans
 from geomocap.segmentation.m3 import ellipsoid_paths
 from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.tracking.nodes import track_nodes
@@ -22,7 +24,7 @@ ANCHOR_SHARE = 0.1  # those are measured in this share of the frames at least
 
 
 def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> tuple[MotionPaths, str]:
-    """Motion paths and what they are: "patches", "nodes", "both" (nodes with patches as anchors) or "ellipsoids".
+    """Motion paths and what they are: "patches", "nodes", "both" (nodes held by patches), "points" or "ellipsoids".
 
     Parameters
     ----------
@@ -34,9 +36,12 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> tuple[Motion
     Raises
     ------
     GeometryError
-        If patches are asked for and there are none.
+        If patches or points are asked for and there are none.
     """
     wanted = job.config.segmentation.paths
+    given = point_paths(job, geometry)
+    if given is not None:
+        return given, "points"
     if wanted == "ellipsoids":
         settings = job.config.segmentation
         found = ellipsoid_paths(geometry.points, len(geometry), geometry.spacing, settings, job.executor, job.progress)
@@ -57,6 +62,25 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> tuple[Motion
         following = following.model_copy(update={"part_rounds": 0})
     nodes = track_nodes(geometry.points, len(geometry), following, features, job.progress, job.executor, anchors)
     return nodes.motion_paths(), "nodes" if anchors is None else "both"
+
+
+def point_paths(job: Job, geometry: Geometry) -> MotionPaths | None:
+    """Paths of points that scans have in common, evenly over the surface; None: they have none, or others are wanted.
+
+    Raises
+    ------
+    GeometryError
+        If these paths are asked for, and there are no scans or they have no points in common.
+    """
+    wanted = job.config.segmentation.paths
+    if wanted not in ("auto", "points"):
+        return None
+    if not isinstance(geometry, Scans):
+        if wanted == "points":
+            raise GeometryError("segmentation.paths = points is for scans; of a capture take auto, patches or nodes")
+        return None
+    tracks = scan_tracks(geometry, wanted == "points", job.progress)
+    return None if tracks is None else MotionPaths(tracks[spread_out(tracks, SAMPLES)])
 
 
 def patch_paths(tracked: dict[str, np.ndarray]) -> MotionPaths | None:

@@ -42,7 +42,7 @@ def segment(job: Job, source: Source) -> str:
 
 def _is_tracked(job: Job, source: Source) -> bool:
     """Whether the surface is to be tracked in the images, which takes a volume."""
-    if job.capture is None or job.config.segmentation.paths in ("nodes", "ellipsoids"):
+    if job.capture is None or job.config.segmentation.paths in ("nodes", "points", "ellipsoids"):
         return False
     return source != "cloud" or bounds_of(job.capture, job.config.cloud) == "hull"
 

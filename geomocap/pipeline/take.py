@@ -15,7 +15,7 @@ from geomocap.files import fingerprint
 from geomocap.geometry import BodyPoints, Geometry
 from geomocap.pipeline.derived import FROM_BODIES
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.paths import OF_TRACKS, patch_paths
+from geomocap.pipeline.paths import OF_TRACKS, patch_paths, point_paths
 from geomocap.pipeline.tracks import tracks
 from geomocap.pipeline.warnings import WARNINGS_FILE, write_warnings
 from geomocap.run import Run, stage_key
@@ -30,10 +30,11 @@ def segment_with_model(job: Job, geometry: Geometry, source_key: str) -> str:
     assert job.model is not None
     model = read_model(job.model).turned_up(job.up_axis)
     patches = None
-    if job.capture is not None and job.config.segmentation.paths != "nodes":
+    wanted = job.config.segmentation.paths
+    if job.capture is not None and wanted != "nodes":
         patches = tracks(job)
     key = stage_key(
-        "take", source_key, patches, fingerprint([job.model]), job.config.take.model_dump(), job.fps, job.up
+        "take", source_key, patches, wanted, fingerprint([job.model]), job.config.take.model_dump(), job.fps, job.up
     )
     outputs = ["ellipsoids.npz", "bodies", "diagnostics.npz", "skeleton.npz", MODEL_FILE]
     work = partial(_follow, job, geometry, model, patches is not None)
@@ -54,7 +55,7 @@ def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) ->
             frames,
             geometry.spacing,
             job.up_axis,
-            patch_paths(job.run.read_npz("tracks.npz", OF_TRACKS)) if patches else None,
+            patch_paths(job.run.read_npz("tracks.npz", OF_TRACKS)) if patches else point_paths(job, geometry),
             job.config.take,
             job.progress,
         )

@@ -16,11 +16,12 @@ class SegmentationSettings(Settings):
         default="motion",
         description="motion: bodies from how the tracked surface turns; m3: the paper's split, merge, match and paths",
     )
-    paths: Literal["auto", "patches", "nodes", "both", "ellipsoids"] = Field(
+    paths: Literal["auto", "patches", "nodes", "both", "points", "ellipsoids"] = Field(
         default="auto",
         description="what follows the surface: patches of the images; nodes on the geometry alone (the images are then "
-        "not tracked at all); both: nodes that patches keep from sliding; ellipsoids: the paper's, split, merged and "
-        "matched, for comparison; auto: patches where they cover the subject, otherwise both",
+        "not tracked at all); both: nodes that patches keep from sliding; points: those of scans which are the same in "
+        "all frames; ellipsoids: the paper's, split, merged and matched, for comparison; auto: of a capture patches "
+        "where they cover the subject, otherwise both; of scans points where neighbours stay so, otherwise nodes",
     )
     max_depth: int = Field(
         default=7, ge=1, le=10, description="levels of splitting; at most 2^levels ellipsoids a frame"

@@ -1,4 +1,4 @@
-"""Captures made harder: given silhouettes, time reversed, cameras that see a part, quite different cameras."""
+"""Captures changed: given silhouettes, time reversed, cameras that see a part, other cameras; scans of the truth."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import pycolmap
 
 from geomocap.cameras import Rig
 from geomocap.capture import Capture
+from geomocap.scan_files import Surface, places_on
 
 LENSES = (
     ("PINHOLE", (640, 480), []),
@@ -68,6 +69,25 @@ def crop(capture: Path, truth: Path) -> None:
         camera.principal_point_y -= rows.start or 0
         camera.height, camera.width = image.shape[:2]
     rig.write(capture / "sparse")
+
+
+def perfect_tracks(truth: Path, scans: Path) -> None:
+    """Make tracks of the true surface, 8,000 points that are the same in all frames."""
+    frames = _true_surfaces(truth)
+    places = places_on(frames[0], 8000, seed=0)
+    np.savez(scans, points=np.stack([places.of(surface.points) for surface in frames]))
+
+
+def fresh_samples(truth: Path, scans: Path) -> None:
+    """Make scans of the true surface, 4,096 points in any order, sampled anew in each frame."""
+    rng = np.random.default_rng(0)
+    frames = enumerate(_true_surfaces(truth))
+    np.savez(scans, points=np.stack([rng.permutation(places_on(s, 4096, seed=k).of(s.points)) for k, s in frames]))
+
+
+def _true_surfaces(truth: Path) -> list[Surface]:
+    with np.load(truth / "truth.npz") as loaded:
+        return [Surface(vertices.astype(float), loaded["faces"]) for vertices in loaded["vertices"]]
 
 
 def different_cameras(capture: Path, truth: Path) -> None:

@@ -20,7 +20,7 @@ from data_tools.asset import AnimatedAsset
 from data_tools.figure import figure, mechanism
 from data_tools.gltf import load_gltf
 from data_tools.synthesize import SynthesisSettings, synthesize
-from tests.benchmarks.changes import crop, different_cameras, give_silhouettes, reverse
+from tests.benchmarks.changes import crop, different_cameras, fresh_samples, give_silhouettes, perfect_tracks, reverse
 from tests.benchmarks.creatures import fan, runner, snake, spider
 
 DATA = Path(os.environ.get("GEOMOCAP_DATA", "."))
@@ -48,14 +48,24 @@ class Case:
         What is done to the folders of capture and truth afterwards.
     flags : tuple of str
         What the run is told beyond the defaults.
+    scans : callable, optional
+        Makes scans of the truth, which are segmented instead of the images.
     """
 
     subject: Callable[[], AnimatedAsset]
     synthesis: dict[str, float] = field(default_factory=dict)
     change: Callable[[Path, Path], None] | None = None
     flags: tuple[str, ...] = ()
+    scans: Callable[[Path, Path], None] | None = None
 
 
+SUBJECTS = {
+    "man walking": man,
+    "horse walking": horse("Walk"),
+    "horse turning": horse("Turn_Left"),
+    "horse rearing": horse("Rear"),
+    "horse kicking": horse("Kick"),
+}
 CASES = {
     "man walking, 30 fps": Case(man),
     "the same, 15 fps": Case(man, {"fps": 15}),
@@ -80,6 +90,14 @@ CASES = {
     "figure, 4 cameras": Case(figure, {"cameras": 4}),
     "horse walking, 4 cameras": Case(horse("Walk"), {"cameras": 4}),
     "man walking, 4 cameras": Case(man, {"cameras": 4}),
+    "man walking, volumes only": Case(
+        man, flags=("--source", "voxels", "--segmentation.paths", "nodes", "--nodes.colors", "false")
+    ),
+    **{f"{name}, perfect tracks": Case(subject, scans=perfect_tracks) for name, subject in SUBJECTS.items()},
+    **{
+        f"{name}, 4,096 points sampled anew in each of 30 frames": Case(subject, {"frames": 30}, scans=fresh_samples)
+        for name, subject in SUBJECTS.items()
+    },
 }
 
 
@@ -98,7 +116,12 @@ def measure(name: str, root: Path) -> dict[str, float]:
             synthesize(case.subject(), capture, truth, SynthesisSettings(**case.synthesis))
         if case.change is not None:
             case.change(capture, truth)
-        _call("run", capture, run, "--no-pictures", *case.flags)
+        if case.scans is None:
+            _call("run", capture, run, "--no-pictures", *case.flags)
+        else:
+            case.scans(truth, folder / "scans.npz")
+            fps = str(SynthesisSettings(**case.synthesis).fps)
+            _call("segment", folder / "scans.npz", run, "--fps", fps, "--no-pictures", *case.flags)
         _call("evaluate", run, truth, "--json", figures)
     return json.loads(figures.read_text())
 

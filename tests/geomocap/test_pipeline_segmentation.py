@@ -36,9 +36,21 @@ def scanned(frames: int) -> np.ndarray:
 
 
 def test_scans_leave_tracks_of_a_capture_alone(job):
-    scans = job(scanned(6))
+    rng = np.random.default_rng(1)
+    scans = job(np.stack([rng.permutation(points) for points in scanned(6)]))
     tracks = np.random.default_rng(0).normal(size=(500, 1, 3)).repeat(6, axis=1)
     scans.run.write_npz("tracks.npz", positions=tracks, sigma=np.full((500, 6), 0.002))
+    segment(scans, "scans")
+    assert scans.run.read_npz("diagnostics.npz")["paths"] == "nodes"
+
+
+def test_points_that_scans_have_in_common_are_followed(job):
+    scans = job(scanned(12))
+    segment(scans, "scans")
+    found = scans.run.read_npz("diagnostics.npz")
+    assert found["paths"] == "points" and scans.run.read_npz("skeleton.npz")["joint_bodies"].tolist() == [[0, 1]]
+    np.testing.assert_allclose(found["sample_positions"].swapaxes(0, 1), scanned(12))
+    scans = job(scanned(12), {**SETTINGS, "segmentation": {"paths": "nodes"}})
     segment(scans, "scans")
     assert scans.run.read_npz("diagnostics.npz")["paths"] == "nodes"
 
