@@ -324,7 +324,7 @@ def _separation(results: Results, stage: Stage | None, desk: Desk) -> list[Block
     words = (
         f"The bodies come from {len(found['sample_body'])} {followed}, followed through all frames. Where a subject "
         "bends in many small steps, like a trunk or a tail, any border is arbitrary: the other numbers of bodies are "
-        "as good. --motion_bodies.bodies sets a number, --motion_bodies.min_turn_deg the criterion."
+        "as good. --bodies sets a number, --motion_bodies.min_turn_deg the criterion."
     )
     blocks = desk.sheet("alternatives", separation.alternatives_sheet(results, stage), "Samples by body", words)
     if "curve_bodies" in found and len(found["curve_bodies"]) > 1:

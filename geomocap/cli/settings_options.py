@@ -1,4 +1,7 @@
-"""Command-line options made from the settings models: each key of the TOML file is a flag `--section.key`."""
+"""Command-line options made from the settings models: each key of the TOML file is a flag `--section.key`.
+
+A setting whose field has `json_schema_extra={"flag": name}` is a flag `--name` as well.
+"""
 
 from __future__ import annotations
 
@@ -126,10 +129,13 @@ def _leaves(model: type[BaseModel], path: tuple[str, ...]) -> Iterator[tuple[tup
 
 def _option(path: tuple[str, ...], field: FieldInfo) -> Any:
     default = field.get_default(call_default_factory=True)
+    extra = field.json_schema_extra
+    short = [f"--{extra['flag']}"] if isinstance(extra, dict) and "flag" in extra else []
     return Annotated[
         str | None,
         typer.Option(
             f"--{'.'.join(path)}",
+            *short,
             metavar=_type_name(field.annotation),
             help=field.description or path[-1].replace("_", " "),
             show_default="none" if default is None else json.dumps(default).strip('"'),

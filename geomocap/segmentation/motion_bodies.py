@@ -31,7 +31,9 @@ _STAGE = "bodies"
 class MotionBodiesSettings(Settings):
     """How rigid bodies are found from motion paths."""
 
-    bodies: int = Field(default=0, ge=0, description="number of bodies; 0: found automatically")
+    bodies: int = Field(
+        default=0, ge=0, description="number of bodies; 0: found automatically", json_schema_extra={"flag": "bodies"}
+    )
     min_turn_deg: float = Field(
         default=15.0, gt=0, lt=180, description="a body turns at least this much against each neighbour (degrees)"
     )

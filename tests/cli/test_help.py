@@ -37,3 +37,8 @@ def test_a_run_that_must_be_there_is_not_said_to_be_made(name):
 def test_each_command_takes_a_settings_file_and_a_number_of_workers(name):
     flags = {flag for p in COMMANDS[name].params for flag in p.opts}
     assert {"--config", "--workers"} <= flags
+
+
+@pytest.mark.parametrize("name", ["run", "segment"])
+def test_the_number_of_bodies_has_a_short_flag(name):
+    assert ["--motion_bodies.bodies", "--bodies"] in [p.opts for p in COMMANDS[name].params]
