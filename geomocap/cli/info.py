@@ -17,11 +17,11 @@ from geomocap.inspection import describe
 @with_file_of_options
 def info(
     path: Annotated[
-        Path, typer.Argument(metavar="PATH", help="Capture, run, calibration or truth folder, or a motion file.")
+        Path, typer.Argument(metavar="PATH", help="Capture, run, calibration or truth folder, motion file, or scans.")
     ],
     workers: Workers = None,
 ) -> None:
-    """Say what a capture, a run, a calibration, a truth or a motion file holds, and what is wrong with it.
+    """Say what a capture, a run, a calibration, a truth, a motion file or scans hold, and what is wrong with them.
 
     The exit status is 1 if something is wrong.
     """

@@ -1,4 +1,4 @@
-"""What a capture, a run, a calibration, a truth or a motion file holds, and what is wrong with it."""
+"""What a capture, a run, a calibration, a truth, a motion file or scans hold, and what is wrong with them."""
 
 from geomocap.inspection.describe import describe
 from geomocap.inspection.description import Description

@@ -10,6 +10,7 @@ from geomocap.inspection.captures import describe_capture
 from geomocap.inspection.description import Description
 from geomocap.inspection.motion_files import ENDINGS, describe_motion_file
 from geomocap.inspection.runs import describe_run
+from geomocap.inspection.scans import SCAN_ENDINGS, describe_scans
 from geomocap.inspection.truths import describe_truth
 
 
@@ -18,7 +19,7 @@ class InspectionError(GeomocapError):
 
 
 def describe(path: Path) -> Description:
-    """Describe a capture, run, calibration, truth or motion file; what is wrong with it is part of the description.
+    """Describe a capture, run, calibration, truth, motion file or scans; what is wrong is part of the description.
 
     Raises
     ------
@@ -37,12 +38,18 @@ def describe(path: Path) -> Description:
         for folder in (path, path / "sparse"):
             if any((folder / f"cameras{ending}").is_file() for ending in (".txt", ".bin")):
                 return describe_calibration(folder)
+        if any(file.suffix.lower() in SCAN_ENDINGS for file in path.iterdir()):
+            return describe_scans(path)
         raise InspectionError(
-            f"{path}: neither a capture (capture.toml), a run (run.toml), a truth (truth.npz) nor a calibration "
-            "(cameras.txt or cameras.bin)"
+            f"{path}: neither a capture (capture.toml), a run (run.toml), a truth (truth.npz), a calibration "
+            f"(cameras.txt or cameras.bin) nor scans ({', '.join(e[1:] for e in SCAN_ENDINGS)})"
         )
     if path.name == "truth.npz":
         return describe_truth(path)
     if path.suffix.lower() in ENDINGS:
         return describe_motion_file(path)
-    raise InspectionError(f"{path}: no known kind of file; motion files are {', '.join(ENDINGS)}")
+    if path.suffix.lower() in SCAN_ENDINGS:
+        return describe_scans(path)
+    raise InspectionError(
+        f"{path}: no known kind of file; motion files are {', '.join(ENDINGS)}, scans {', '.join(SCAN_ENDINGS)}"
+    )

@@ -14,7 +14,7 @@ class Description:
     ----------
     path : Path
     kind : str
-        "capture", "run", "calibration", "truth" or "motion file".
+        "capture", "run", "calibration", "truth", "motion file" or "scans".
     facts : list of (what, value)
     problems : list of str
         One line each; empty if nothing is wrong.

@@ -1,6 +1,7 @@
 import numpy as np
 import pycolmap
 import pytest
+import trimesh
 from cv2 import imwrite
 
 from geomocap.cameras import Rig
@@ -162,6 +163,31 @@ def test_motion_files_with_problems(motion_files):
     assert "it was cut off" in describe(glb).problems[0]
     glb.write_bytes(b"glb")
     assert "no GLB file" in describe(glb).problems[0]
+
+
+def test_scans(tmp_path):
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(50, 3))
+    for k in range(6):
+        np.savez(tmp_path / f"{k}.npz", points=points + 0.1 * k)
+    told = describe(tmp_path)
+    facts = dict(told.facts)
+    assert told.kind == "scans" and facts["frames"] == "6" and facts["points"] == "50 in a frame"
+    assert "tracks" in facts["points in common"] and told.problems == []
+    np.savez(tmp_path / "1.npz", points=np.append(points, [[np.nan, 0, 0]], axis=0))
+    facts = dict(describe(tmp_path).facts)
+    assert facts["points"] == "50 to 51 in a frame" and facts["missing points"] == "0.3% (NaN)"
+    assert facts["points in common"].startswith("no")
+    for k in range(2, 6):
+        np.savez(tmp_path / f"{k}.npz", points=np.full((4, 3), np.inf))
+    told = describe(tmp_path)
+    assert "2.npz: 4 points are infinite" in told.problems[0] and "1 more scan" in told.problems[3]
+    (tmp_path / "2.npz").unlink()
+    assert "number 2 is missing" in describe(tmp_path).problems[0]
+    mesh = trimesh.creation.box()
+    mesh.export(tmp_path / "box.ply")
+    facts = dict(describe(tmp_path / "box.ply").facts)
+    assert facts["meshes"] == "8 vertices, 12 triangles" and "one scan" in facts["motion"]
 
 
 def test_nothing_known(tmp_path):
