@@ -35,18 +35,14 @@ class Motion:
 
     Attributes
     ----------
-    positions : (N, T, 3) float, metres
-        Smoothed positions.
     velocities : (N, T, 3) float, m/s
     accelerations : (N, T, 3) float, m/s²
-    position_std, velocity_std, acceleration_std : (N, T) float
+    velocity_std, acceleration_std : (N, T) float
         Standard deviation of each coordinate that the measurement's noise leaves.
     """
 
-    positions: np.ndarray
     velocities: np.ndarray
     accelerations: np.ndarray
-    position_std: np.ndarray
     velocity_std: np.ndarray
     acceleration_std: np.ndarray
 
@@ -84,8 +80,8 @@ def smooth_motion(
     known = measured & np.isfinite(sd)
     weight = np.where(known, 1 / np.where(known, sd, 1.0) ** 2, 0.0)
     value = np.where(known[:, :, None], positions, 0.0)
-    out = np.full((N, T, 3, 3), np.nan)
-    std = np.full((N, T, 3), np.nan)
+    out = np.full((2, N, T, 3), np.nan)
+    std = np.full((2, N, T), np.nan)
     square, freedom = 0.0, 0
     for t in range(T):
         low, high = max(t - h, 0), min(t + h + 1, T)
@@ -104,13 +100,12 @@ def smooth_motion(
             miss = (value[rows, low:high] - powers @ fit) * (w[rows] > 0)[:, :, None]
             square += float((miss**2).sum())
             freedom += 3 * int((w[rows] > 0).sum() - terms * len(rows))
-        unit = np.array([1.0, fps / h, 2 * (fps / h) ** 2])
-        count = min(terms, 3)
-        out[rows, t, :count] = fit[:, :count] * unit[:count, None]
-        std[rows, t, :count] = spread[:, :count] * unit[:count]
+        for order, unit in enumerate((fps / h, 2 * (fps / h) ** 2)[: settings.degree]):
+            out[order, rows, t] = unit * fit[:, 1 + order]
+            std[order, rows, t] = unit * spread[:, 1 + order]
     if sigma is None:
         std *= np.sqrt(square / freedom) if freedom > 0 else np.nan
-    return Motion(out[:, :, 0], out[:, :, 1], out[:, :, 2], std[:, :, 0], std[:, :, 1], std[:, :, 2])
+    return Motion(*out, *std)
 
 
 def noise_gain(settings: SmoothingSettings, fps: float) -> tuple[float, float]:
