@@ -16,6 +16,7 @@ from geomocap.open3d_files import check_ply, read_by_open3d
 MESH_ENDINGS = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 CLOUD_ENDINGS = (".ply", ".pcd", ".xyz", ".pts")
 ARRAY_ENDINGS = (".npz", ".npy")
+_TRACKS = {"positions", "start", "end"}  # what tells `tracks.npz` of a run
 
 
 @dataclass(frozen=True)
@@ -109,8 +110,22 @@ def read_surface(path: Path) -> Surface:
     return Surface(np.asarray(cloud.points))
 
 
+def holds_tracks(path: Path) -> bool:
+    """Whether a file is `tracks.npz` of a run: positions (N, T, 3) of the same points, with gaps."""
+    if path.suffix.lower() != ".npz":
+        return False
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return set(data.files) >= _TRACKS
+    except (OSError, ValueError, EOFError):
+        return False  # what is wrong with it, reading it says
+
+
 def read_array(path: Path) -> np.ndarray:
-    """Read points of shape (N, 3) or (T, N, 3) from an NPZ or NPY file, never executing anything in it."""
+    """Read points of shape (N, 3) or (T, N, 3) from an NPZ or NPY file, never executing anything in it.
+
+    Of tracks, whose first axis is that of the points, the axes are exchanged.
+    """
     try:
         data = np.load(path, allow_pickle=False)
         if isinstance(data, np.ndarray):
@@ -124,6 +139,8 @@ def read_array(path: Path) -> np.ndarray:
                         f"it has {', '.join(data.files)}"
                     )
                 array = data[name]
+                if _TRACKS <= set(data.files) and array.ndim == 3:
+                    array = array.swapaxes(0, 1)
     except (OSError, ValueError, EOFError) as error:
         raise GeometryError(f"{path}: can't be read as plain arrays ({error})") from None
     if array.ndim not in (2, 3) or array.shape[-1] != 3 or array.dtype.kind not in "fiu":

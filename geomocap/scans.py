@@ -26,6 +26,7 @@ from geomocap.scan_files import (
     MESH_ENDINGS,
     Places,
     Surface,
+    holds_tracks,
     places_on,
     read_array,
     read_surface,
@@ -60,12 +61,15 @@ class Scans:
     read : callable
         `read(frame) -> Surface`, scan units.
     settings : ScanSettings
+    tracked : bool
+        Whether the points are known to be the same in all frames.
     """
 
     source: Path
     names: tuple[str, ...]
     read: Callable[[int], Surface]
     settings: ScanSettings
+    tracked: bool = False
 
     features = None
 
@@ -171,7 +175,7 @@ def open_scans(source: Path, settings: ScanSettings) -> Scans:
         if not len(frames):
             raise GeometryError(f"{source}: holds no frames; expected points of shape (T, N, 3), got {array.shape}")
         names = tuple(f"{source}, frame {k}" for k in range(len(frames)))
-        return Scans(source, names, lambda k: Surface(frames[k]), settings)
+        return Scans(source, names, lambda k: Surface(frames[k]), settings, holds_tracks(source))
     return Scans(source, (str(source),), lambda _: read_surface(source), settings)
 
 

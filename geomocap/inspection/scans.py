@@ -43,7 +43,7 @@ def describe_scans(path: Path) -> Description:
     if len(scans) == 1:
         told.fact("motion", "none: one scan gets its ellipsoids")
     elif not told.problems:
-        common = scan_tracks(scans) is not None
+        common = scans.tracked or scan_tracks(scans) is not None
         told.fact("points in common", "yes, they are taken as tracks" if common else "no, the surface is followed")
     return told
 

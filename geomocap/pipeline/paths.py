@@ -79,7 +79,7 @@ def point_paths(job: Job, geometry: Geometry) -> MotionPaths | None:
         if wanted == "points":
             raise GeometryError("segmentation.paths = points is for scans; of a capture take auto, patches or nodes")
         return None
-    tracks = scan_tracks(geometry, wanted == "points", job.progress)
+    tracks = scan_tracks(geometry, wanted == "points" or geometry.tracked, job.progress)
     return None if tracks is None else MotionPaths(tracks[spread_out(tracks, SAMPLES)])
 
 

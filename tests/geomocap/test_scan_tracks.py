@@ -65,6 +65,18 @@ def test_points_in_one_order_are_tracks_with_their_gaps(tmp_path):
     assert_allclose(tracks, np.stack(points, axis=1))
 
 
+def test_trajectories_of_a_run_are_tracks_with_any_gaps(tmp_path):
+    rng = np.random.default_rng(0)
+    tracks = np.stack([moved(BALL.vertices, k) for k in range(T)], axis=1)
+    tracks[rng.random(tracks.shape[:2]) < 0.5] = np.nan
+    seen = np.isfinite(tracks[:, :, 0])
+    np.savez(tmp_path / "tracks.npz", positions=tracks, start=seen.argmax(axis=1), end=np.full(len(tracks), T - 1))
+    scans = open_scans(tmp_path / "tracks.npz", ScanSettings(scale=2.0))
+    assert len(scans) == T and scans.tracked
+    np.testing.assert_array_equal(scans.points(1), 2 * tracks[seen[:, 1], 1])
+    np.testing.assert_array_equal(scan_tracks(scans, scans.tracked), 2 * tracks[seen.any(axis=1)])
+
+
 def test_of_many_points_some_are_followed_the_same_each_time(tmp_path):
     ball = trimesh.creation.icosphere(5).vertices
     scans = scans_of([moved(ball, k) for k in range(3)], tmp_path)
