@@ -159,7 +159,7 @@ def trajectories_of(arrays: dict[str, np.ndarray], source: Path | str = "tracks.
     return Trajectories(
         positions,
         np.full((N, T, 3, 3), np.nan),
-        arrays.get("sigma", np.full((N, T), np.nan)),
+        np.asarray(arrays.get("sigma", np.full((N, T), np.nan)), np.float64),
         arrays.get("correlation", np.full((N, T), np.nan)),
         arrays.get("n_views", np.isfinite(positions[:, :, 0]).astype(int)),
         arrays.get("sight", np.zeros((N, T, 3))),

@@ -88,7 +88,7 @@ def patch_paths(tracked: dict[str, np.ndarray]) -> MotionPaths | None:
     chosen = spread_out(tracked["positions"], SAMPLES)
     if not len(chosen):
         return None
-    sigma = tracked["sigma"][chosen]
+    sigma = tracked["sigma"][chosen].astype(float)
     # standard deviations with the median where a sample was not seen
     sigma = np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma))
     sight = tracked["sight"][chosen].astype(float) if "sight" in tracked else np.zeros((*sigma.shape, 3))

@@ -76,7 +76,9 @@ def smooth_motion(
     N, T = positions.shape[:2]
     h, terms = settings.half_width, settings.degree + 1
     measured = np.isfinite(positions).all(axis=2)
-    sd = np.ones((N, T)) if sigma is None else np.where(np.isfinite(sigma) & (sigma > 0), sigma, np.nan)
+    sd = np.ones((N, T))
+    if sigma is not None:
+        sd = np.where(np.isfinite(sigma) & (sigma > 0), np.asarray(sigma, np.float64), np.nan)
     known = measured & np.isfinite(sd)
     weight = np.where(known, 1 / np.where(known, sd, 1.0) ** 2, 0.0)
     value = np.where(known[:, :, None], positions, 0.0)

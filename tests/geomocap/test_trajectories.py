@@ -77,6 +77,15 @@ def test_standard_deviations_are_those_of_the_noise():
         assert_allclose(error.std(), 1, atol=0.04)
 
 
+def test_standard_deviations_may_be_in_single_precision():
+    rng = np.random.default_rng(3)
+    path, sigma = rng.normal(size=(20, 30, 3)), 1e-4 * rng.uniform(1, 2, (20, 30)).astype(np.float32)
+    path[::2, 10:12] = np.nan
+    one, other = smooth_motion(path, FPS, sigma), smooth_motion(path, FPS, sigma.astype(float))
+    for name in one.__dataclass_fields__:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
 def test_noise_is_found_from_the_residuals_if_it_is_not_given():
     noisy = np.random.default_rng(0).normal(0, 1e-3, (400, 20, 3))
     gain = noise_gain(SmoothingSettings(), FPS)[0]
