@@ -31,11 +31,12 @@ bench: .stamps/dev
 	tools/system_packages.sh
 	"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11) and "geomocap needs Python 3.11 or newer: make PYTHON=/path/to/python3.11 …")'
 	"$(PYTHON)" -m venv $(VENV)
-	$(BIN)/pip install -q -e .
+	$(BIN)/pip install -q --no-compile -e .  # Python compiles what is used when it is used first
 	mkdir -p .stamps && touch $@
 
 .stamps/dev: .stamps/core
-	$(BIN)/pip install -q -e '.[dev]'
+	$(BIN)/pip install -q --no-compile -e '.[dev]'
+	$(BIN)/python -m compileall -q -j 0 $(VENV)/lib || true  # some packages bring files for other versions of Python
 	touch $@
 
 clean:

@@ -12,7 +12,7 @@ from geomocap.open3d_files import read_by_open3d
 from viz.drawing import sheet, write_png
 from viz.floor import floor
 from viz.palette import body_colors
-from viz.render import render
+from viz.render import Model
 from viz.results import read_points
 from viz.shapes import Mesh, vertex_normals
 from viz.sheets import VIEWS, tile_size
@@ -105,9 +105,10 @@ def render_file(path: Path, picture: Path | None = None, up: str = "z") -> Path:
         raise RunError(f"{target}: no name of a picture; expected one of the endings {', '.join(PICTURES)}")
     mesh = load(path)
     stage = stage_of([mesh.vertices], [0], 1, up_vector(up))
+    model = Model([mesh])
     tiles: list[np.ndarray | None] = []
     for angles in VIEWS.values():
         view = stage.view(*angles, tile_size(stage, *angles, 160_000))
-        tiles.append(render([mesh], view, None, stage.up).over(floor(stage, view, [mesh])))
+        tiles.append(model.render(view, None, stage.up).over(floor(stage, view, model.meshes)))
     write_png(target, sheet([tiles], (), tuple(VIEWS)))
     return target

@@ -13,6 +13,7 @@ from viz.views import PinholeView, Stage
 
 LINE = (222, 225, 229)
 SHADE = (120, 126, 135)
+_VERTICES = 40_000  # about as many throw the shadow
 
 
 def grid_spacing(extent: float) -> float:
@@ -85,6 +86,7 @@ def _shadow(
     cells = 160
     reach = 0.75 * stage.extent
     vertices = np.concatenate([m.vertices for m in meshes])
+    vertices = vertices[:: max(1, len(vertices) // _VERTICES)]
     flat = (vertices - base) @ basis.T
     height = (vertices - base) @ stage.up
     weight = np.exp(-np.maximum(height, 0) / (0.12 * stage.extent))

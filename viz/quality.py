@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 import cv2
@@ -9,7 +10,7 @@ import numpy as np
 
 from geomocap.scheduling import map_items, threads
 from viz import scene
-from viz.render import Look, render
+from viz.render import Look, Model
 from viz.results import Ellipsoids, Results, Skeleton
 from viz.views import camera_view
 
@@ -71,21 +72,30 @@ def agreement(results: Results, frames: list[int], longest_side: int = 320) -> d
     capture = results.capture
     if capture is None or not capture.is_calibrated or not results.silhouette_cameras:
         return {}
-    frames = [f for f in frames if results.has("voxels", f)]
-    found: dict[str, list[tuple[float, float]]] = {}
-    for frame in frames:
-        mesh = scene.volume(results, frame)
-        for camera in results.silhouette_cameras:
+    rig = capture.rig
+    cameras = [c for c in results.silhouette_cameras if c in rig.names]
+
+    def measure(frame: int) -> list[tuple[str, float, float]]:
+        model = Model([scene.volume(results, frame)])
+        found = []
+        for camera in cameras:
             mask = results.silhouette(camera, frame)
-            if mask is None or camera not in capture.rig.names:
+            if mask is None:
                 continue
-            view = camera_view(capture.rig, capture.rig.names.index(camera), longest_side)
-            seen = render([mesh], view, Look(samples=1, outline=0, hollows=0)).rgba[..., 3]
+            view = camera_view(rig, rig.names.index(camera), longest_side)
+            seen = model.render(view, Look(samples=1, outline=0, hollows=0)).rgba[..., 3]
             given = cv2.resize(mask, view.size, interpolation=cv2.INTER_AREA) / 255.0
             both = float(np.minimum(seen, given).sum())
             if given.sum() > 0 and seen.sum() > 0:
-                found.setdefault(camera, []).append((both / float(given.sum()), both / float(seen.sum())))
-    means = {c: np.mean(v, axis=0) for c, v in found.items()}
+                found.append((camera, both / float(given.sum()), both / float(seen.sum())))
+        return found
+
+    with threads() as executor:
+        measured = list(map_items(measure, [f for f in frames if results.has("voxels", f)], executor))
+    shares: dict[str, list[tuple[float, float]]] = {}
+    for camera, covered, inside in itertools.chain.from_iterable(measured):
+        shares.setdefault(camera, []).append((covered, inside))
+    means = {c: np.mean(v, axis=0) for c, v in shares.items()}
     return {c: (float(m[0]), float(m[1])) for c, m in means.items()}
 
 

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import open3d as o3d
 
+from viz.ray_kernels import mark_tiles, shade
 from viz.shapes import Mesh
 from viz.views import View
 
@@ -78,15 +79,14 @@ class _Surfaces:
 
 
 def _surfaces(meshes: Sequence[Mesh]) -> _Surfaces | None:
-    meshes = [m for m in meshes if len(m.faces)]
     if not meshes:
         return None
-    starts = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
-    faces = np.concatenate([m.faces + s for m, s in zip(meshes, starts, strict=True)])
+    vertices, faces = _triangles(meshes)
     sizes = [len(m.faces) for m in meshes]
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)  # frames are rendered side by side
-    vertices = np.concatenate([m.vertices for m in meshes]).astype(np.float32)
-    scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(faces.astype(np.uint32)))
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor.from_numpy(vertices.astype(np.float32)), o3d.core.Tensor.from_numpy(faces.astype(np.uint32))
+    )
     return _Surfaces(
         scene,
         faces,
@@ -98,6 +98,63 @@ def _surfaces(meshes: Sequence[Mesh]) -> _Surfaces | None:
     )
 
 
+def _triangles(meshes: Sequence[Mesh]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and triangles (F, 3) of all meshes."""
+    starts = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
+    faces = np.concatenate([m.faces + s for m, s in zip(meshes, starts, strict=True)])
+    return np.concatenate([m.vertices for m in meshes]), np.ascontiguousarray(faces)
+
+
+class Model:
+    """Meshes, opaque and translucent, made ready once to be rendered from many views.
+
+    Parameters
+    ----------
+    meshes : sequence of Mesh
+        In any order; those without triangles are left out.
+    """
+
+    def __init__(self, meshes: Sequence[Mesh]) -> None:
+        self.meshes = [m for m in meshes if len(m.faces)]
+        self._opaque = _surfaces([m for m in self.meshes if m.alpha >= 1])
+        self._clear = _surfaces([m for m in self.meshes if m.alpha < 1])
+
+    def render(self, view: View, look: Look | None = None, up: np.ndarray | None = None) -> Layer:
+        """Render the meshes as a view sees them.
+
+        Parameters
+        ----------
+        view : View
+        look : Look, optional
+        up : (3,) float, optional
+            World direction from which some more light comes.
+
+        Returns
+        -------
+        Layer
+        """
+        look = look or Look()
+        width, height = view.size
+        result = np.zeros((height, width, 4), np.float32)
+        touched = _touched(self.meshes, view)
+        rows, columns = np.flatnonzero(touched.any(axis=1)), np.flatnonzero(touched.any(axis=0))
+        if len(rows) == 0:
+            return Layer(result)
+        top, bottom, left, right = int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+        s = look.samples
+        wanted = np.repeat(np.repeat(touched[top:bottom, left:right], s, axis=0), s, axis=1)
+        y, x = np.nonzero(wanted)
+        origin, directions = view.rays(np.column_stack([left + (x + 0.5) / s, top + (y + 0.5) / s]))
+        rays = _Rays(origin.astype(np.float32), directions.astype(np.float32), wanted)
+
+        near = _opaque(self._opaque, rays, look, up)
+        rgba = near.rgba if self._clear is None else _peel(self._clear, rays, near, look, up)
+        samples = np.zeros((*wanted.shape, 4), np.float32)
+        samples[wanted] = rgba
+        result[top:bottom, left:right] = cv2.resize(samples, (right - left, bottom - top), interpolation=cv2.INTER_AREA)
+        return Layer(result)
+
+
 def _labels(number: int, mesh: Mesh) -> np.ndarray:
     """One number for each mesh and colour, (F,) int64."""
     if not mesh.outlined:
@@ -106,43 +163,8 @@ def _labels(number: int, mesh: Mesh) -> np.ndarray:
 
 
 def render(meshes: Sequence[Mesh], view: View, look: Look | None = None, up: np.ndarray | None = None) -> Layer:
-    """Render meshes as a view sees them.
-
-    Parameters
-    ----------
-    meshes : sequence of Mesh
-        Opaque and translucent ones, in any order.
-    view : View
-    look : Look, optional
-    up : (3,) float, optional
-        World direction from which some more light comes.
-
-    Returns
-    -------
-    Layer
-    """
-    look = look or Look()
-    width, height = view.size
-    result = np.zeros((height, width, 4), np.float32)
-    meshes = [m for m in meshes if len(m.faces)]
-    touched = _touched(meshes, view)
-    rows, columns = np.flatnonzero(touched.any(axis=1)), np.flatnonzero(touched.any(axis=0))
-    if len(rows) == 0:
-        return Layer(result)
-    top, bottom, left, right = int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
-    s = look.samples
-    wanted = np.repeat(np.repeat(touched[top:bottom, left:right], s, axis=0), s, axis=1)
-    y, x = np.nonzero(wanted)
-    origin, directions = view.rays(np.column_stack([left + (x + 0.5) / s, top + (y + 0.5) / s]))
-    rays = _Rays(origin.astype(np.float32), directions.astype(np.float32), wanted)
-
-    near = _opaque(_surfaces([m for m in meshes if m.alpha >= 1]), rays, look, up)
-    clear = _surfaces([m for m in meshes if m.alpha < 1])
-    rgba = near.rgba if clear is None else _peel(clear, rays, near, look, up)
-    samples = np.zeros((*wanted.shape, 4), np.float32)
-    samples[wanted] = rgba
-    result[top:bottom, left:right] = cv2.resize(samples, (right - left, bottom - top), interpolation=cv2.INTER_AREA)
-    return Layer(result)
+    """Render meshes as one view sees them; see `Model.render`."""
+    return Model(meshes).render(view, look, up)
 
 
 @dataclass(frozen=True)
@@ -168,22 +190,13 @@ def _touched(meshes: Sequence[Mesh], view: View) -> np.ndarray:
     width, height = view.size
     if not meshes:
         return np.zeros((height, width), bool)
-    pixels, depth = view.project(np.concatenate([m.vertices for m in meshes]))
+    vertices, faces = _triangles(meshes)
+    pixels, depth = view.project(vertices)
     if (depth <= 1e-6).any() or not np.isfinite(pixels).all():
         return np.ones((height, width), bool)  # something reaches behind the view
-    starts = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
-    corners = pixels[np.concatenate([m.faces + s for m, s in zip(meshes, starts, strict=True)])]
-    margin, tile = 1.5, 8
-    shape = np.array([-(-height // tile), -(-width // tile)])
-    low = np.floor((corners.min(axis=1) - margin) / tile).astype(int)[:, ::-1]
-    high = np.floor((corners.max(axis=1) + margin) / tile).astype(int)[:, ::-1] + 1
-    inside = ((high > 0) & (low < shape)).all(axis=1)
-    low, high = np.clip(low[inside], 0, shape), np.clip(high[inside], 0, shape)
-    counts = np.zeros((shape[0] + 1, shape[1] + 1), np.int64)  # differences, summed below
-    for rows, columns, sign in ((low, low, 1), (high, high, 1), (low, high, -1), (high, low, -1)):
-        index = rows[:, 0] * counts.shape[1] + columns[:, 1]
-        counts += sign * np.bincount(index, minlength=counts.size).reshape(counts.shape)
-    tiles = counts.cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0
+    tile = 8
+    tiles = np.zeros((-(-height // tile), -(-width // tile)), bool)
+    mark_tiles(np.ascontiguousarray(pixels), faces, 1.5, tile, tiles)
     return np.repeat(np.repeat(tiles, tile, axis=0), tile, axis=1)[:height, :width]
 
 
@@ -208,20 +221,10 @@ def _cast(
     return distance, triangle, uv
 
 
-def _normals(surfaces: _Surfaces, triangle: np.ndarray, uv: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Interpolated unit normals that face the viewer."""
-    corner = surfaces.faces[triangle]
-    u, v = uv[:, :1], uv[:, 1:]
-    n = (1 - u - v) * surfaces.normals[corner[:, 0]]
-    n += u * surfaces.normals[corner[:, 1]] + v * surfaces.normals[corner[:, 2]]
-    n /= np.maximum(np.sqrt(np.einsum("ij,ij->i", n, n)), 1e-9)[:, None]
-    away = np.einsum("ij,ij->i", n, directions) > 0
-    n[away] *= -1
-    return n
-
-
-def _shade(albedo: np.ndarray, normals: np.ndarray, directions: np.ndarray, up: np.ndarray | None) -> np.ndarray:
-    """Soft light from the upper left of the viewer, some from above, and a faint highlight."""
+def _shade(
+    surfaces: _Surfaces, triangle: np.ndarray, uv: np.ndarray, directions: np.ndarray, up: np.ndarray | None
+) -> np.ndarray:
+    """Colours and opacities (N, 4) of hits, in soft light from the upper left of the viewer."""
     forward = directions.mean(axis=0)
     forward /= np.linalg.norm(forward)
     above = np.asarray(up if up is not None else -forward, np.float32)
@@ -231,14 +234,10 @@ def _shade(albedo: np.ndarray, normals: np.ndarray, directions: np.ndarray, up: 
     head = np.cross(right, forward)
     key = -forward - 0.45 * right + 0.65 * head
     key = (key / np.linalg.norm(key)).astype(np.float32)
-    diffuse = np.clip(normals @ key, 0, 1)
-    facing = np.clip(-np.einsum("ij,ij->i", normals, directions), 0, 1)
-    sky = 0.5 + 0.5 * (normals @ above.astype(np.float32))
-    half = key - directions
-    half /= np.sqrt(np.einsum("ij,ij->i", half, half))[:, None]
-    shine = np.clip(np.einsum("ij,ij->i", normals, half), 0, 1) ** 40
-    light = 0.30 + 0.16 * sky + 0.20 * facing + 0.44 * diffuse
-    return np.clip(albedo * light[:, None] + 0.10 * shine[:, None], 0, 1)
+    rgba = np.empty((len(triangle), 4), np.float32)
+    s = surfaces
+    shade(triangle, uv, directions, s.faces, s.normals, s.colors, s.alpha, s.rim, key, above, rgba)
+    return rgba
 
 
 def _opaque(surfaces: _Surfaces | None, rays: _Rays, look: Look, up: np.ndarray | None) -> _Near:
@@ -248,16 +247,15 @@ def _opaque(surfaces: _Surfaces | None, rays: _Rays, look: Look, up: np.ndarray 
     distance, triangle, uv = _cast(surfaces.scene, rays.origin, rays.directions)
     hit = np.isfinite(distance)
     if hit.any():
-        triangle, d = triangle[hit], rays.directions[hit]
-        normals = _normals(surfaces, triangle, uv[hit], d)
-        color = _shade(surfaces.colors[triangle], normals, d, up)
+        triangle = triangle[hit]
+        shaded = _shade(surfaces, triangle, uv[hit], rays.directions[hit], up)
         depth = rays.spread(distance, np.inf)
         label = np.zeros(len(rays), np.int64)
         label[hit] = surfaces.label[triangle]
         dark = 1 - look.hollows * _hollows(depth, look.samples)
         dark *= 1 - look.outline * _edges(depth, rays.spread(label, 0))
-        rgba[hit, :3] = color * dark[rays.wanted][hit, None]
-        rgba[hit, 3] = 1
+        shaded[:, :3] *= dark[rays.wanted][hit, None]
+        rgba[hit] = shaded
     return _Near(rgba, distance)
 
 
@@ -308,12 +306,9 @@ def _peel(clear: _Surfaces, rays: _Rays, near: _Near, look: Look, up: np.ndarray
         if len(alive) == 0:
             break
         d = rays.directions[alive]
-        normals = _normals(clear, triangle, uv, d)
-        facing = np.clip(-np.einsum("ij,ij->i", normals, d), 0, 1)
-        alpha = np.clip(clear.alpha[triangle] + clear.rim[triangle] * (1 - facing) ** 2, 0, 1)
-        color = _shade(clear.colors[triangle], normals, d, up)
-        left = (1 - rgba[alive, 3]) * alpha
-        rgba[alive, :3] += left[:, None] * color
+        shaded = _shade(clear, triangle, uv, d, up)
+        left = (1 - rgba[alive, 3]) * shaded[:, 3]
+        rgba[alive, :3] += left[:, None] * shaded[:, :3]
         rgba[alive, 3] += left
         step = distance * np.float32(1 + 1e-5) + np.float32(1e-5)
         travelled[alive] += step

@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from viz.drawing import sheet
 from viz.figures import WIDTH, figure_of, plot
 from viz.palette import ACCENT, INK, body_color, body_colors, hex_color
+from viz.render import Model
 from viz.report import Block, table
 from viz.results import Results
 from viz.sheets import VIEWS, picture, tile_size
@@ -78,7 +79,7 @@ def alternatives_sheet(results: Results, stage: Stage) -> np.ndarray | None:
         row: list[np.ndarray | None] = []
         for _, label in columns:
             drawn = replace(gems(points, body_colors(label), radius), outlined=True)
-            row.append(picture(results, stage, [drawn], sight, frame))
+            row.append(picture(results, stage, Model([drawn]), sight, frame))
         tiles.append(row)
     return sheet(tiles, (), [name for name, _ in columns])
 

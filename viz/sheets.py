@@ -10,7 +10,7 @@ from geomocap.scheduling import map_items, threads
 from viz import palette, scene
 from viz.drawing import faded, fit, outlined, resize, sheet, write_on
 from viz.floor import floor
-from viz.render import Look, render
+from viz.render import Look, Model, render
 from viz.results import Results
 from viz.shapes import Mesh, frustum
 from viz.views import PinholeView, Stage, camera_view
@@ -38,14 +38,13 @@ def tile_size(stage: Stage, azimuth_deg: float, elevation_deg: float, area: floa
 
 
 def picture(
-    results: Results, stage: Stage, meshes: Sequence[Mesh], view: PinholeView, frame: int, look: Look | None = None
+    results: Results, stage: Stage, model: Model, view: PinholeView, frame: int, look: Look | None = None
 ) -> np.ndarray:
-    """Return a free view of meshes on the floor, (H, W, 3) uint8."""
+    """Return a free view of a model on the floor, (H, W, 3) uint8."""
     place = results.place(frame)
     moved = stage.at(view, place)
     center = stage.centers[min(place, len(stage.centers) - 1)]
-    solid = [m for m in meshes if len(m.faces)]
-    return render(solid, moved, look, stage.up).over(floor(stage, moved, solid, center))
+    return model.render(moved, look, stage.up).over(floor(stage, moved, model.meshes, center))
 
 
 def volume_meshes(results: Results, frame: int) -> list[Mesh]:
@@ -84,8 +83,8 @@ def geometry_sheet(
     sights = [stage.view(*VIEWS[v], tile_size(stage, *VIEWS[v])) for v in views]
 
     def column(frame: int) -> list[np.ndarray]:
-        meshes = build(results, frame)
-        return [picture(results, stage, meshes, sight, frame) for sight in sights]
+        model = Model(build(results, frame))
+        return [picture(results, stage, model, sight, frame) for sight in sights]
 
     with threads() as executor:
         columns = list(map_items(column, list(frames), executor))
@@ -95,9 +94,9 @@ def geometry_sheet(
 
 def path_sheet(results: Results, stage: Stage, frame: int) -> np.ndarray:
     """Return the paths of the whole sequence, views beside each other, with the volume of one frame as glass."""
-    meshes = path_meshes(results, frame)
+    model = Model(path_meshes(results, frame))
     sights = [stage.view(*angles, tile_size(stage, *angles, 130_000)) for angles in VIEWS.values()]
-    return sheet([[picture(results, stage, meshes, sight, frame) for sight in sights]], (), tuple(VIEWS))
+    return sheet([[picture(results, stage, model, sight, frame) for sight in sights]], (), tuple(VIEWS))
 
 
 def story_sheet(
@@ -108,7 +107,7 @@ def story_sheet(
     sight = stage.view(azimuth, elevation, tile_size(stage, azimuth, elevation))
 
     def column(frame: int) -> list[np.ndarray]:
-        return [picture(results, stage, build(results, frame), sight, frame) for _, build in rows]
+        return [picture(results, stage, Model(build(results, frame)), sight, frame) for _, build in rows]
 
     with threads() as executor:
         columns = list(map_items(column, list(frames), executor))
@@ -160,14 +159,14 @@ def _named(image: np.ndarray, name: str) -> np.ndarray:
 
 
 def overlay(
-    results: Results, camera: str, frame: int, meshes: Sequence[Mesh], longest_side: int = 420, opacity: float = 0.85
+    results: Results, camera: str, frame: int, model: Model, longest_side: int = 420, opacity: float = 0.85
 ) -> np.ndarray:
-    """Return meshes drawn over a camera's image, distortion included: (H, W, 3) uint8."""
+    """Return a model drawn over a camera's image, distortion included: (H, W, 3) uint8."""
     capture = results.capture
     assert capture is not None
     view = camera_view(capture.rig, capture.rig.names.index(camera), longest_side)
     photograph = resize(capture.frame(camera, frame), view.size)
-    return render(meshes, view).over(faded(photograph, 0.35), opacity)
+    return model.render(view).over(faded(photograph, 0.35), opacity)
 
 
 def overlay_sheet(
@@ -177,7 +176,7 @@ def overlay_sheet(
     capture = results.capture
     if capture is None or not capture.is_calibrated:
         return None
-    built = {f: build(results, f) for f in frames}
+    built = {f: Model(build(results, f)) for f in frames}
     jobs = [(camera, frame) for frame in frames for camera in capture.cameras]
 
     def tile(job: tuple[str, int]) -> np.ndarray:

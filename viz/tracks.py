@@ -198,14 +198,16 @@ def _draw_trails(
     known = np.isfinite(trails[:, :, 0])
     last = trails[np.arange(len(trails)), trails.shape[1] - 1 - known[:, ::-1].argmax(axis=1)]
     show = np.flatnonzero(_front(view, last)) if hide else np.arange(len(trails))
+    pixels = np.full((*known.shape, 2), np.nan)
+    pixels[known] = view.project(trails[known])[0]
+    drawn = np.isfinite(pixels[:, :, 0]) & np.isfinite(pixels[:, :, 1])
     for n in show.tolist():
-        pixel, _ = view.project(trails[n, known[n]])
-        points = np.round(8 * (pixel[np.isfinite(pixel).all(axis=1)] - 0.5)).astype(np.int32)
+        points = np.round(8 * (pixels[n, drawn[n]] - 0.5)).astype(np.int32)
         cv2.polylines(canvas, [points], False, colors[n], 1, cv2.LINE_AA, shift=3)
+    ends, _ = view.project(last)
     for n in show.tolist():
-        pixel, _ = view.project(last[n : n + 1])
-        if np.isfinite(pixel).all():
-            cv2.circle(canvas, _pixel(pixel[0]), 1, colors[n], -1, cv2.LINE_AA)
+        if np.isfinite(ends[n]).all():
+            cv2.circle(canvas, _pixel(ends[n]), 1, colors[n], -1, cv2.LINE_AA)
     return canvas
 
 

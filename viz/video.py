@@ -16,6 +16,7 @@ from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads
 from viz import scene
 from viz.drawing import GAP, fit, write_on
+from viz.render import Model
 from viz.results import Results
 from viz.sheets import overlay, picture, tile_size
 from viz.views import Stage
@@ -111,12 +112,12 @@ def motion_video(
         bones = scene.skeleton(results, frame, stage.extent)
         panels = []
         if show_bodies:
-            panels.append(picture(results, stage, [skin], view, frame))
+            panels.append(picture(results, stage, Model([skin]), view, frame))
+        model = Model([scene.glass(skin), *bones] if bones else [skin])
         if bones:
-            panels.append(picture(results, stage, [scene.glass(skin), *bones], view, frame))
+            panels.append(picture(results, stage, model, view, frame))
         if camera is not None:
-            meshes = [scene.glass(skin), *bones] if bones else [skin]
-            drawn = overlay(results, camera, frame, meshes, 520, 1.0 if bones else 0.7)
+            drawn = overlay(results, camera, frame, model, 520, 1.0 if bones else 0.7)
             panels.append(fit(drawn, (round(size[1] * drawn.shape[1] / drawn.shape[0]), size[1])))
         gap = np.full((size[1], GAP, 3), 255, np.uint8)
         image = np.concatenate([p for panel in panels for p in (panel, gap)][:-1], axis=1)

@@ -206,8 +206,11 @@ def _system(
         part = bodies.part(some)
         threads = numba.get_num_threads()
         numba.set_num_threads(threads if some.stop - some.start > _FEW else 1)
+        unknowns = size + shared
+        matrix, sides = np.zeros((len(part.rotations), unknowns, unknowns)), np.zeros((len(part.rotations), unknowns))
+        costs = np.empty(len(part.rotations))
         try:
-            matrix, sides, costs = normal_equations(
+            normal_equations(
                 part.rotations,
                 part.translations,
                 _twists(linkage, motion.part(some), part, joint_prior is not None),
@@ -223,6 +226,9 @@ def _system(
                 observations.isotropic,
                 observations.across,
                 cutoff,
+                matrix,
+                sides,
+                costs,
             )
         finally:
             numba.set_num_threads(threads)

@@ -59,10 +59,12 @@ def _frame_equations(
     isotropic,
     across,
     cutoff,
-    matrix,
-    right,
+    matrices,
+    rights,
+    costs,
 ):
-    """Fill matrix (K, K) and right (K,) of frame t and return its cost; other parameters as of `normal_equations`."""
+    """Fill the matrix, right side and cost of frame t; parameters as of `normal_equations`."""
+    matrix, right = matrices[t], rights[t]
     count = rotations.shape[1]
     unknowns = twists.shape[1]
     most = bodies.shape[1]
@@ -133,7 +135,7 @@ def _frame_equations(
                     for i in range(6):
                         value += carried[u, i] * twists[t, w, i]
                     matrix[u, w] += value
-    return cost
+    costs[t] = cost
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -153,7 +155,10 @@ def normal_equations(
     isotropic: np.ndarray,
     across: np.ndarray,
     cutoff: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    matrix: np.ndarray,
+    right: np.ndarray,
+    cost: np.ndarray,
+) -> None:
     """Gauss–Newton normal equations of each frame, observations weighted by 1 / (1 + χ² / cutoff²) (Cauchy).
 
     Parameters
@@ -178,21 +183,13 @@ def normal_equations(
         Weight of the distance from the target, and of that along the normal.
     cutoff : float
         In standard deviations.
-
-    Returns
-    -------
-    matrix : (T, K, K) float
-    right : (T, K) float
+    matrix, right : (T, K, K), (T, K) float
+        Zeros; the equations are added to them.
     cost : (T,) float
-        Half the sum of cutoff² log(1 + χ² / cutoff²).
+        Filled: half the sum of cutoff² log(1 + χ² / cutoff²).
     """
-    frames = rotations.shape[0]
-    unknowns = twists.shape[1]
-    matrix = np.zeros((frames, unknowns, unknowns))
-    right = np.zeros((frames, unknowns))
-    cost = np.zeros(frames)
-    for t in prange(frames):
-        cost[t] = _frame_equations(
+    for t in prange(len(rotations)):
+        _frame_equations(
             np.int64(t),
             rotations,
             translations,
@@ -209,7 +206,7 @@ def normal_equations(
             isotropic,
             across,
             cutoff,
-            matrix[t],
-            right[t],
+            matrix,
+            right,
+            cost,
         )
-    return matrix, right, cost

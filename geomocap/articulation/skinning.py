@@ -38,15 +38,18 @@ def fit_shares(
         Weight of the squared difference from the present shares, beside the mean squared distance.
     """
     count = bodies.rotations.shape[1]
-    shares = _fit_shares(
+    present = points.weights(count)
+    shares = np.zeros(present.shape)
+    _fit_shares(
         points.rest,
         np.ascontiguousarray(bodies.rotations),
         np.ascontiguousarray(bodies.translations),
         np.where(np.isfinite(positions), positions, 0.0),
         weights,
         candidates,
-        points.weights(count),
+        present,
         pull,
+        shares,
     )
     return SkinPoints.of_weights(points.rest, shares)
 
@@ -132,17 +135,6 @@ def _fit_one(n, rest, rotations, translations, positions, weights, candidates, p
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _fit_shares(
-    rest: np.ndarray,
-    rotations: np.ndarray,
-    translations: np.ndarray,
-    positions: np.ndarray,
-    weights: np.ndarray,
-    candidates: np.ndarray,
-    present: np.ndarray,
-    pull: np.ndarray,
-) -> np.ndarray:
-    result = np.zeros(present.shape)
+def _fit_shares(rest, rotations, translations, positions, weights, candidates, present, pull, result):
     for n in numba.prange(len(weights)):
         _fit_one(np.int64(n), rest, rotations, translations, positions, weights, candidates, present, pull, result)
-    return result

@@ -13,21 +13,30 @@ LEVELS = 5  # blocks of 32, 16, 8, 4 and 2 voxels
 BACKGROUND, SUBJECT, UNSEEN, MIXED = 0, 1, 2, 3
 
 
+@njit(cache=True, nogil=True)
+def _sum_up(c, masks, out):
+    """Fill the table of camera c, which holds zeros."""
+    H, W = masks.shape[1:]
+    for v in range(H):
+        total = np.int32(0)
+        for u in range(W):
+            total += np.int32(masks[c, v, u])
+            out[c, v + 1, u + 1] = total
+        for u in range(1, W + 1):
+            out[c, v + 1, u] += out[c, v, u]
+
+
 @njit(cache=True, nogil=True, parallel=True)
-def summed(masks):
+def _sum_all(masks, out):
+    for c in prange(len(masks)):
+        _sum_up(np.int64(c), masks, out)
+
+
+def summed(masks: np.ndarray) -> np.ndarray:
     """Summed-area tables (C, H + 1, W + 1) int32 of masks (C, H, W) of 0 and 1."""
     C, H, W = masks.shape
-    out = np.empty((C, H + 1, W + 1), np.int32)
-    for c in prange(C):
-        out[c, 0, :] = 0
-        for v in range(H):
-            total = np.int32(0)
-            out[c, v + 1, 0] = 0
-            for u in range(W):
-                total += np.int32(masks[c, v, u])
-                out[c, v + 1, u + 1] = total
-            for u in range(1, W + 1):
-                out[c, v + 1, u] += out[c, v, u]
+    out = np.zeros((C, H + 1, W + 1), np.int32)
+    _sum_all(masks, out)
     return out
 
 

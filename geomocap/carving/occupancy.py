@@ -52,12 +52,12 @@ class Occupancy:
 
     def surface(self) -> Occupancy:
         """Return the occupied voxels that have an empty one among their six neighbours, or lie on the grid's border."""
-        bits, _ = _surface_bits(self.bits)
+        bits, _ = _surface(self.bits)
         return Occupancy(bits, self.shape)
 
     def surface_indices(self) -> np.ndarray:
         """Return the surface voxels, (N, 3) int32, sorted by x, y, z index."""
-        return _indices(*_surface_bits(self.bits))
+        return _indices(*_surface(self.bits))
 
     def indices(self) -> np.ndarray:
         """Return the occupied voxels, (N, 3) int32, sorted by x, y, z index."""
@@ -90,35 +90,42 @@ def _slab_counts(bits):
     return counts
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _surface_bits(bits):
-    """Keep the bits with an unset one among their six neighbours; also count them for every x index."""
+@njit(cache=True, nogil=True)
+def _slab_surface(i, bits, surface, counts):
+    """Keep the bits of x index i with an unset one among their six neighbours, and count them; filled in place."""
     X, Y, K = bits.shape
-    surface = np.zeros((X, Y, K), np.uint32)
-    counts = np.zeros(X, np.int64)
-    for i in prange(X):
-        count = 0
-        for j in range(Y):
-            border = i == 0 or j == 0 or i == X - 1 or j == Y - 1
-            for k in range(K):
-                word = bits[i, j, k]
-                if word == 0:
-                    continue
-                rest = word
-                if not border:
-                    below = np.uint32(word << np.uint32(1))
-                    if k > 0:
-                        below |= np.uint32(bits[i, j, k - 1] >> np.uint32(31))
-                    above = np.uint32(word >> np.uint32(1))
-                    if k < K - 1:
-                        above |= np.uint32(bits[i, j, k + 1] << np.uint32(31))
-                    inner = (
-                        below & above & bits[i - 1, j, k] & bits[i + 1, j, k] & bits[i, j - 1, k] & bits[i, j + 1, k]
-                    )
-                    rest = np.uint32(word & ~inner)
-                surface[i, j, k] = rest
-                count += _popcount(rest)
-        counts[i] = count
+    count = 0
+    for j in range(Y):
+        border = i == 0 or j == 0 or i == X - 1 or j == Y - 1
+        for k in range(K):
+            word = bits[i, j, k]
+            if word == 0:
+                continue
+            rest = word
+            if not border:
+                below = np.uint32(word << np.uint32(1))
+                if k > 0:
+                    below |= np.uint32(bits[i, j, k - 1] >> np.uint32(31))
+                above = np.uint32(word >> np.uint32(1))
+                if k < K - 1:
+                    above |= np.uint32(bits[i, j, k + 1] << np.uint32(31))
+                inner = below & above & bits[i - 1, j, k] & bits[i + 1, j, k] & bits[i, j - 1, k] & bits[i, j + 1, k]
+                rest = np.uint32(word & ~inner)
+            surface[i, j, k] = rest
+            count += _popcount(rest)
+    counts[i] = count
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _slab_surfaces(bits, surface, counts):
+    for i in prange(len(bits)):
+        _slab_surface(np.int64(i), bits, surface, counts)
+
+
+def _surface(bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bits with an unset one among their six neighbours, and how many there are at every x index."""
+    surface, counts = np.zeros_like(bits), np.zeros(len(bits), np.int64)
+    _slab_surfaces(bits, surface, counts)
     return surface, counts
 
 

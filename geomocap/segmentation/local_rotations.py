@@ -10,44 +10,40 @@ from geomocap.segmentation.rotations import nearest_rotation
 _LEAST_FRAMES = 8
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
-def _local_moments(
-    positions: np.ndarray,
-    reference: np.ndarray,
-    weights: np.ndarray,
-    first: np.ndarray,
-    members: np.ndarray,
-    nearness: np.ndarray,
-) -> np.ndarray:
-    count, frames = weights.shape
-    moments = np.zeros((count, frames, 3, 3))
-    for i in numba.prange(count):
-        center = np.empty(3)
-        start = np.empty(3)
-        for t in range(frames):
-            total = 0.0
-            center[:] = 0.0
-            start[:] = 0.0
-            for q in range(first[i], first[i + 1]):
-                j = members[q]
-                w = nearness[q] * weights[j, t]
-                total += w
-                for c in range(3):
-                    center[c] += w * positions[j, t, c]
-                    start[c] += w * reference[j, c]
-            if total <= 0.0:
-                continue
+@numba.njit(cache=True, nogil=True)
+def _moments_of(i, positions, reference, weights, first, members, nearness, moments):
+    """Add up the moments of sample i."""
+    center = np.empty(3)
+    start = np.empty(3)
+    for t in range(weights.shape[1]):
+        total = 0.0
+        center[:] = 0.0
+        start[:] = 0.0
+        for q in range(first[i], first[i + 1]):
+            j = members[q]
+            w = nearness[q] * weights[j, t]
+            total += w
             for c in range(3):
-                center[c] /= total
-                start[c] /= total
-            for q in range(first[i], first[i + 1]):
-                j = members[q]
-                w = nearness[q] * weights[j, t] / total
-                for a in range(3):
-                    moved = w * (positions[j, t, a] - center[a])
-                    for b in range(3):
-                        moments[i, t, a, b] += moved * (reference[j, b] - start[b])
-    return moments
+                center[c] += w * positions[j, t, c]
+                start[c] += w * reference[j, c]
+        if total <= 0.0:
+            continue
+        for c in range(3):
+            center[c] /= total
+            start[c] /= total
+        for q in range(first[i], first[i + 1]):
+            j = members[q]
+            w = nearness[q] * weights[j, t] / total
+            for a in range(3):
+                moved = w * (positions[j, t, a] - center[a])
+                for b in range(3):
+                    moments[i, t, a, b] += moved * (reference[j, b] - start[b])
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _local_moments(positions, reference, weights, first, members, nearness, moments):
+    for i in numba.prange(len(weights)):
+        _moments_of(np.int64(i), positions, reference, weights, first, members, nearness, moments)
 
 
 def local_rotations(
@@ -77,46 +73,47 @@ def local_rotations(
     rows, members = np.nonzero(near)
     first = np.concatenate([[0], np.cumsum(near.sum(axis=1))])
     nearness = np.exp(-((geodesics[rows, members] / (0.6 * radius)) ** 2))
-    moments = _local_moments(
-        np.ascontiguousarray(positions), np.ascontiguousarray(reference), weights, first, members, nearness
+    moments = np.zeros((*weights.shape, 3, 3))
+    _local_moments(
+        np.ascontiguousarray(positions), np.ascontiguousarray(reference), weights, first, members, nearness, moments
     )
     # what flat or thin neighbourhoods leave open stays as it was in the reference
     size = np.trace(moments, axis1=2, axis2=3)[..., None, None]
     return nearest_rotation(moments + (1e-9 * np.abs(size) + 1e-15) * np.eye(3))
 
 
+@numba.njit(cache=True, nogil=True)
+def _turns_of(i, flat, known, share, least_frames, result):
+    """Compare sample i with those before it."""
+    frames = known.shape[1]
+    least = np.empty(1 + int(share * (frames - 1)), np.float32)
+    for j in range(i):
+        common = 0
+        for t in range(frames):
+            common += known[i, t] and known[j, t]
+        every = common < least_frames
+        rank = 1 + int(share * ((frames if every else common) - 1))
+        least[:] = 3.0
+        for t in range(frames):
+            if not (every or (known[i, t] and known[j, t])):
+                continue
+            trace = np.float32(0.0)
+            for c in range(9):
+                trace += flat[i, t, c] * flat[j, t, c]
+            if trace < least[0]:  # least holds the smallest traces so far, largest of them first
+                k = 0
+                while k + 1 < rank and least[k + 1] > trace:
+                    least[k] = least[k + 1]
+                    k += 1
+                least[k] = trace
+        cosine = min(max((least[0] - np.float32(1.0)) / np.float32(2.0), np.float32(-1.0)), np.float32(1.0))
+        result[i, j] = result[j, i] = np.arccos(cosine)
+
+
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _turn_distances(flat: np.ndarray, known: np.ndarray, share: float, least_frames: int) -> np.ndarray:
-    count, frames = known.shape
-    most = 1 + int(share * (frames - 1))
-    result = np.zeros((count, count), np.float32)
-    for i in numba.prange(count):
-        least = np.empty(most, np.float32)
-        for j in range(i):
-            common = 0
-            for t in range(frames):
-                common += known[i, t] and known[j, t]
-            every = common < least_frames
-            rank = 1 + int(share * ((frames if every else common) - 1))
-            least[:] = 3.0
-            for t in range(frames):
-                if not (every or (known[i, t] and known[j, t])):
-                    continue
-                trace = np.float32(0.0)
-                for c in range(9):
-                    trace += flat[i, t, c] * flat[j, t, c]
-                if trace < least[0]:  # least holds the smallest traces so far, largest of them first
-                    k = 0
-                    while k + 1 < rank and least[k + 1] > trace:
-                        least[k] = least[k + 1]
-                        k += 1
-                    least[k] = trace
-            cosine = min(max((least[0] - np.float32(1.0)) / np.float32(2.0), np.float32(-1.0)), np.float32(1.0))
-            result[i, j] = np.arccos(cosine)
-    for i in range(count):
-        for j in range(i):
-            result[j, i] = result[i, j]
-    return result
+def _turn_distances(flat, known, share, least_frames, result):
+    for i in numba.prange(len(known)):
+        _turns_of(np.int64(i), flat, known, share, least_frames, result)
 
 
 def turn_distances(
@@ -146,4 +143,6 @@ def turn_distances(
         looked_at = np.linspace(0, frames - 1, most_frames).round().astype(int)
         rotations, known = rotations[:, looked_at], known[:, looked_at]
     flat = np.ascontiguousarray(rotations.reshape(*known.shape, 9), np.float32)
-    return _turn_distances(flat, np.ascontiguousarray(known), share, min(_LEAST_FRAMES, known.shape[1]))
+    result = np.zeros((count, count), np.float32)
+    _turn_distances(flat, np.ascontiguousarray(known), share, min(_LEAST_FRAMES, known.shape[1]), result)
+    return result

@@ -19,6 +19,7 @@ from geomocap.progress import Progress, silent
 from geomocap.segmentation.motion_bodies import MotionBodies, MotionBodiesSettings, find_motion_bodies
 from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.segmentation.rigid_motions import fit_rigid_motion
+from geomocap.segmentation.skin_blending import solve_symmetric
 
 _DEPTH_SHARE = 0.05  # of what is missed along a line of sight, counts for a sample's place
 _ROUNDS = 2  # in which samples choose bodies and these move anew
@@ -193,7 +194,71 @@ def _place(paths: MotionPaths, rotations: np.ndarray, translations: np.ndarray) 
     return _Places(*found)
 
 
+@numba.njit(cache=True, nogil=True)
+def _place_sample(i, m, positions, seen, sight, rotations, translations, depth_share, largest, rest, miss, depth):
+    """Place sample i with motion m; parameters as of `place_samples`, its results filled."""
+    part = 1.0 - depth_share**2
+    away, ray, place = np.empty(3), np.empty(3), np.empty(3)
+    normal, right = _REGULAR * np.eye(3), np.zeros(3)
+    for t in range(seen.shape[1]):
+        if not seen[i, t]:
+            continue
+        along = 0.0
+        for c in range(3):
+            away[c] = positions[i, t, c] - translations[m, t, c]
+            along += away[c] * sight[i, t, c]
+            ray[c] = 0.0
+            for d in range(3):
+                ray[c] += rotations[m, t, d, c] * sight[i, t, d]
+        for c in range(3):
+            away[c] -= part * along * sight[i, t, c]
+        for c in range(3):
+            for d in range(3):
+                right[c] += rotations[m, t, d, c] * away[d]
+                for e in range(3):  # of rotations this is 1 or 0, of blends not
+                    normal[c, d] += rotations[m, t, e, c] * rotations[m, t, e, d]
+                normal[c, d] -= part * ray[c] * ray[d]
+    solve_symmetric(normal, right, place)
+    square, number = 0.0, 0
+    for t in range(seen.shape[1]):
+        if not seen[i, t]:
+            continue
+        along = 0.0
+        for c in range(3):
+            away[c] = translations[m, t, c] - positions[i, t, c]
+            for d in range(3):
+                away[c] += rotations[m, t, c, d] * place[d]
+            along += away[c] * sight[i, t, c]
+        across = 0.0
+        for c in range(3):
+            across += (away[c] - along * sight[i, t, c]) ** 2
+        depth[i, t] = along
+        square += min(across, largest**2)
+        number += 1
+    for c in range(3):
+        rest[i, c] = place[c]
+    miss[i] = np.sqrt(square / max(number, 1))
+
+
 @numba.njit(cache=True, nogil=True, parallel=True)
+def _place_all(motion, positions, seen, sight, rotations, translations, depth_share, largest, rest, miss, depth):
+    for i in numba.prange(len(seen)):
+        _place_sample(
+            np.int64(i),
+            motion[i],
+            positions,
+            seen,
+            sight,
+            rotations,
+            translations,
+            depth_share,
+            largest,
+            rest,
+            miss,
+            depth,
+        )
+
+
 def place_samples(
     positions: np.ndarray,
     seen: np.ndarray,
@@ -228,47 +293,6 @@ def place_samples(
     """
     count, frames = seen.shape
     rest, miss, depth = np.zeros((count, 3)), np.zeros(count), np.zeros((count, frames))
-    part = 1.0 - depth_share**2
     motion = np.arange(count) if len(rotations) > 1 else np.zeros(count, np.int64)
-    for i in numba.prange(count):
-        m = motion[i]
-        away, ray = np.empty(3), np.empty(3)
-        normal, right = _REGULAR * np.eye(3), np.zeros(3)
-        for t in range(frames):
-            if not seen[i, t]:
-                continue
-            along = 0.0
-            for c in range(3):
-                away[c] = positions[i, t, c] - translations[m, t, c]
-                along += away[c] * sight[i, t, c]
-                ray[c] = 0.0
-                for d in range(3):
-                    ray[c] += rotations[m, t, d, c] * sight[i, t, d]
-            for c in range(3):
-                away[c] -= part * along * sight[i, t, c]
-            for c in range(3):
-                for d in range(3):
-                    right[c] += rotations[m, t, d, c] * away[d]
-                    for e in range(3):  # of rotations this is 1 or 0, of blends not
-                        normal[c, d] += rotations[m, t, e, c] * rotations[m, t, e, d]
-                    normal[c, d] -= part * ray[c] * ray[d]
-        place = np.linalg.solve(normal, right)
-        square, number = 0.0, 0
-        for t in range(frames):
-            if not seen[i, t]:
-                continue
-            along = 0.0
-            for c in range(3):
-                away[c] = translations[m, t, c] - positions[i, t, c]
-                for d in range(3):
-                    away[c] += rotations[m, t, c, d] * place[d]
-                along += away[c] * sight[i, t, c]
-            across = 0.0
-            for c in range(3):
-                across += (away[c] - along * sight[i, t, c]) ** 2
-            depth[i, t] = along
-            square += min(across, largest**2)
-            number += 1
-        rest[i] = place
-        miss[i] = np.sqrt(square / max(number, 1))
+    _place_all(motion, positions, seen, sight, rotations, translations, depth_share, largest, rest, miss, depth)
     return rest, miss, depth

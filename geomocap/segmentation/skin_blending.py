@@ -32,6 +32,24 @@ class Blends:
 
 
 @numba.njit(cache=True, nogil=True)
+def solve_symmetric(N, b, x):
+    """Solve N x = b for x (3,) by cofactors; N (3, 3) symmetric and positive definite, `x` may be `b`."""
+    xx, xy, xz = (
+        N[1, 1] * N[2, 2] - N[1, 2] * N[1, 2],
+        N[0, 2] * N[1, 2] - N[0, 1] * N[2, 2],
+        N[0, 1] * N[1, 2] - N[0, 2] * N[1, 1],
+    )
+    yy, yz, zz = (
+        N[0, 0] * N[2, 2] - N[0, 2] * N[0, 2],
+        N[0, 1] * N[0, 2] - N[0, 0] * N[1, 2],
+        N[0, 0] * N[1, 1] - N[0, 1] * N[0, 1],
+    )
+    determinant = N[0, 0] * xx + N[0, 1] * xy + N[0, 2] * xz
+    u, v, w = b[0] / determinant, b[1] / determinant, b[2] / determinant
+    x[0], x[1], x[2] = xx * u + xy * v + xz * w, xy * u + yy * v + yz * w, xz * u + yz * v + zz * w
+
+
+@numba.njit(cache=True, nogil=True)
 def _place_at_rest(positions, weights, total, sight, rotations, translations, place):
     """Place of a sample at rest by one body's motion, least squares over the frames; weights sum to `total`."""
     place[:] = 0.0
@@ -59,7 +77,7 @@ def _place_at_rest(positions, weights, total, sight, rotations, translations, pl
             for d in range(3):
                 place[d] += w * rotations[t, c, d] * away[c]
     if len(sight):
-        place[:] = np.linalg.solve(normal, place)
+        solve_symmetric(normal, place, place)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -151,24 +169,22 @@ def _explain_one(
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _explain(
-    positions: np.ndarray,
-    weights: np.ndarray,
-    sight: np.ndarray,
-    rest: np.ndarray,
-    certain: np.ndarray,
-    rotations: np.ndarray,
-    translations: np.ndarray,
-    allowed: np.ndarray,
-    adjacent: np.ndarray,
-    penalty: float,
-    cap: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    count = len(weights)
-    bodies = len(rotations)
-    costs = np.full((count, bodies), np.inf)
-    partner = np.full((count, bodies), -1, np.int32)
-    share = np.ones((count, bodies))
-    for i in numba.prange(count):
+    positions,
+    weights,
+    sight,
+    rest,
+    certain,
+    rotations,
+    translations,
+    allowed,
+    adjacent,
+    penalty,
+    cap,
+    costs,
+    partner,
+    share,
+):
+    for i in numba.prange(len(weights)):
         _explain_one(
             np.int64(i),
             positions,
@@ -186,7 +202,6 @@ def _explain(
             partner,
             share,
         )
-    return costs, partner, share
 
 
 def explain(
@@ -224,18 +239,22 @@ def explain(
     cap : float, metres
         Larger residuals of single frames count as this.
     """
-    return Blends(
-        *_explain(
-            np.ascontiguousarray(positions),
-            weights,
-            np.zeros((len(weights), 0, 3)) if sight is None else np.ascontiguousarray(sight, float),
-            rest,
-            certain,
-            np.ascontiguousarray(rotations),
-            np.ascontiguousarray(translations),
-            allowed,
-            adjacent,
-            penalty**2,
-            cap**2,
-        )
+    shape = (len(weights), len(rotations))
+    blends = Blends(np.full(shape, np.inf), np.full(shape, -1, np.int32), np.ones(shape))
+    _explain(
+        np.ascontiguousarray(positions),
+        weights,
+        np.zeros((len(weights), 0, 3)) if sight is None else np.ascontiguousarray(sight, float),
+        rest,
+        certain,
+        np.ascontiguousarray(rotations),
+        np.ascontiguousarray(translations),
+        allowed,
+        adjacent,
+        penalty**2,
+        cap**2,
+        blends.costs,
+        blends.partner,
+        blends.share,
     )
+    return blends

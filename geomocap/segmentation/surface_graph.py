@@ -49,29 +49,32 @@ def frames_looked_at(frames: int, most: int = FRAMES_LOOKED_AT) -> np.ndarray:
     return np.unique(np.linspace(0, frames - 1, min(frames, most)).round().astype(int))
 
 
+@numba.njit(cache=True, nogil=True)
+def _distances_of(i, positions, rank, result):
+    """Fill row i."""
+    best = np.empty(rank)
+    for j in range(len(positions)):
+        if j == i:
+            continue
+        best[:] = 0.0
+        for t in range(positions.shape[1]):
+            x = positions[i, t, 0] - positions[j, t, 0]
+            y = positions[i, t, 1] - positions[j, t, 1]
+            z = positions[i, t, 2] - positions[j, t, 2]
+            square = x * x + y * y + z * z
+            if square > best[0]:  # best holds the largest so far, smallest of them first
+                k = 0
+                while k + 1 < rank and best[k + 1] < square:
+                    best[k] = best[k + 1]
+                    k += 1
+                best[k] = square
+        result[i, j] = np.sqrt(best[0])
+
+
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _lasting_distances(positions: np.ndarray, rank: int) -> np.ndarray:
-    count, frames = positions.shape[:2]
-    result = np.zeros((count, count), np.float32)
-    for i in numba.prange(count):
-        best = np.empty(rank)
-        for j in range(count):
-            if j == i:
-                continue
-            best[:] = 0.0
-            for t in range(frames):
-                x = positions[i, t, 0] - positions[j, t, 0]
-                y = positions[i, t, 1] - positions[j, t, 1]
-                z = positions[i, t, 2] - positions[j, t, 2]
-                square = x * x + y * y + z * z
-                if square > best[0]:  # best holds the largest so far, smallest of them first
-                    k = 0
-                    while k + 1 < rank and best[k + 1] < square:
-                        best[k] = best[k + 1]
-                        k += 1
-                    best[k] = square
-            result[i, j] = np.sqrt(best[0])
-    return result
+def _lasting_distances(positions, rank, result):
+    for i in numba.prange(len(positions)):
+        _distances_of(np.int64(i), positions, rank, result)
 
 
 def lasting_distances(positions: np.ndarray) -> np.ndarray:
@@ -91,25 +94,31 @@ def lasting_distances(positions: np.ndarray) -> np.ndarray:
     """
     looked_at = frames_looked_at(positions.shape[1])
     rank = 3 if len(looked_at) >= 12 else 1
-    return _lasting_distances(np.ascontiguousarray(positions[:, looked_at], np.float64), rank)
+    result = np.zeros((len(positions), len(positions)), np.float32)
+    _lasting_distances(np.ascontiguousarray(positions[:, looked_at], np.float64), rank, result)
+    return result
+
+
+@numba.njit(cache=True, nogil=True)
+def _bridges_of(i, apart, limit, result):
+    """Fill row i."""
+    count = len(apart)
+    for j in range(count):
+        distance = apart[i, j]
+        if j == i or distance > min(limit[i], limit[j]):
+            continue
+        between = False
+        for k in range(count):
+            if max(apart[i, k], apart[k, j]) < distance:
+                between = True
+                break
+        result[i, j] = not between
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _bridges(apart: np.ndarray, limit: np.ndarray) -> np.ndarray:
-    count = len(apart)
-    result = np.zeros((count, count), np.bool_)
-    for i in numba.prange(count):
-        for j in range(count):
-            distance = apart[i, j]
-            if j == i or distance > min(limit[i], limit[j]):
-                continue
-            between = False
-            for k in range(count):
-                if max(apart[i, k], apart[k, j]) < distance:
-                    between = True
-                    break
-            result[i, j] = not between
-    return result
+def _bridges(apart, limit, result):
+    for i in numba.prange(len(apart)):
+        _bridges_of(np.int64(i), apart, limit, result)
 
 
 def bridges(apart: np.ndarray, limit: np.ndarray) -> np.ndarray:
@@ -129,7 +138,9 @@ def bridges(apart: np.ndarray, limit: np.ndarray) -> np.ndarray:
     (N, N) bool
         Symmetric.
     """
-    return _bridges(apart, limit.astype(np.float32))
+    result = np.zeros(apart.shape, bool)
+    _bridges(apart, limit.astype(np.float32), result)
+    return result
 
 
 def surface_graph(positions: np.ndarray, reference: np.ndarray, neighbours: int, max_stretch: float) -> SurfaceGraph:

@@ -32,7 +32,8 @@ def nearest_companions(positions: np.ndarray, seen: np.ndarray, wanted: int) -> 
         return np.tile(np.arange(count)[:, None], (1, wanted))
     pairs = np.unique(np.stack([np.concatenate(rows_list), np.concatenate(columns_list)], axis=1), axis=0)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    cost = _pair_costs(positions, seen, pairs[:, 0].copy(), pairs[:, 1].copy())
+    cost = np.empty(len(pairs))
+    _pair_costs(positions, seen, pairs[:, 0].copy(), pairs[:, 1].copy(), cost)
     order = np.lexsort((cost, pairs[:, 0]))
     pairs = pairs[order]
     first = np.searchsorted(pairs[:, 0], np.arange(count))
@@ -43,25 +44,27 @@ def nearest_companions(positions: np.ndarray, seen: np.ndarray, wanted: int) -> 
     return result
 
 
+@numba.njit(cache=True, nogil=True)
+def _pair_cost(i, j, positions, seen):
+    """Mean distance of two samples plus four times how much it varies; more where they are seldom seen together."""
+    total, squares, common = 0.0, 0.0, 0
+    for t in range(seen.shape[1]):
+        if seen[i, t] and seen[j, t]:
+            square = 0.0
+            for c in range(3):
+                square += (positions[i, t, c] - positions[j, t, c]) ** 2
+            total += np.sqrt(square)
+            squares += square
+            common += 1
+    mean = total / max(common, 1)
+    spread = np.sqrt(max(squares / max(common, 1) - mean * mean, 0.0))
+    return (mean + 4.0 * spread) * (1.0 if common >= _LEAST_COMMON else 3.0)
+
+
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _pair_costs(positions: np.ndarray, seen: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    frames = seen.shape[1]
-    result = np.empty(len(first))
+def _pair_costs(positions, seen, first, second, result):
     for p in numba.prange(len(first)):
-        i, j = first[p], second[p]
-        total, squares, common = 0.0, 0.0, 0
-        for t in range(frames):
-            if seen[i, t] and seen[j, t]:
-                square = 0.0
-                for c in range(3):
-                    square += (positions[i, t, c] - positions[j, t, c]) ** 2
-                total += np.sqrt(square)
-                squares += square
-                common += 1
-        mean = total / max(common, 1)
-        spread = np.sqrt(max(squares / max(common, 1) - mean * mean, 0.0))
-        result[p] = (mean + 4.0 * spread) * (1.0 if common >= _LEAST_COMMON else 3.0)
-    return result
+        result[p] = _pair_cost(first[p], second[p], positions, seen)
 
 
 @numba.njit(cache=True, nogil=True)

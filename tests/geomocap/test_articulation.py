@@ -78,7 +78,8 @@ def test_kernel_agrees_with_the_sums_written_out():
     normal = rng.normal(size=(seen, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     isotropic, across = rng.random((2, seen))
-    matrix, right, cost = normal_equations(
+    matrix, right, cost = np.zeros((frames, unknowns, unknowns)), np.zeros((frames, unknowns)), np.empty(frames)
+    normal_equations(
         rotations,
         translations,
         twists,
@@ -94,6 +95,9 @@ def test_kernel_agrees_with_the_sums_written_out():
         isotropic,
         across,
         cutoff,
+        matrix,
+        right,
+        cost,
     )
     for t in range(frames):
         expected, side, total = np.zeros((unknowns, unknowns)), np.zeros(unknowns), 0.0

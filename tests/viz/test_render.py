@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geomocap.cameras import Rig
-from viz.render import Layer, Look, render
+from viz.ray_kernels import mark_tiles, shade
+from viz.render import Layer, Look, Model, render
 from viz.shapes import EMPTY, ball, ellipsoid, tube
 from viz.views import CameraView, PinholeView, Stage, camera_view, look, stage_of
 
@@ -150,3 +151,53 @@ def test_pinhole_view_moves() -> None:
     point = np.array([[0.1, 0.2, -0.1]])
     offset = np.array([3.0, 2.0, 1.0])
     np.testing.assert_allclose(view.moved(offset).project(point + offset)[0], view.project(point)[0])
+
+
+def test_model_looks_the_same_from_every_view_as_if_made_for_it() -> None:
+    meshes = [ball([0, 0, 1], 0.3, (9, 200, 9)).translucent(0.3), ball([0, 0.1, 1], 0.1, (200, 0, 0))]
+    model = Model(meshes)
+    for size in (120, 60):
+        view = camera_view(rig(), 0, size)
+        assert np.array_equal(model.render(view).rgba, render(meshes, view).rgba)
+
+
+def test_shading_kernel_agrees_with_numpy() -> None:
+    rng = np.random.default_rng(0)
+
+    def unit(count: int) -> np.ndarray:
+        v = rng.normal(size=(count, 3))
+        return v / np.linalg.norm(v, axis=1, keepdims=True)
+
+    faces, normals, colors = rng.integers(0, 30, (40, 3)), unit(30), rng.random((40, 3))
+    alpha, rim = rng.random(40), rng.random(40)
+    triangle, directions, (key, above) = rng.integers(0, 40, 500), unit(500), unit(2)
+    uv = rng.dirichlet(np.ones(3), 500)[:, :2]
+    rgba = np.empty((500, 4))
+    shade(triangle, uv, directions, faces, normals, colors, alpha, rim, key, above, rgba)
+
+    n = np.einsum("nk,nki->ni", np.column_stack([1 - uv.sum(axis=1), uv]), normals[faces[triangle]])
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    n *= -np.sign((n * directions).sum(axis=1, keepdims=True))
+    facing = -(n * directions).sum(axis=1)
+    half = key - directions
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    light = 0.30 + 0.16 * (0.5 + 0.5 * n @ above) + 0.20 * facing + 0.44 * np.clip(n @ key, 0, 1)
+    shine = np.clip((n * half).sum(axis=1), 0, 1) ** 40
+    expected = np.clip(colors[triangle] * light[:, None] + 0.10 * shine[:, None], 0, 1)
+    np.testing.assert_allclose(rgba[:, :3], expected, atol=1e-12)
+    np.testing.assert_allclose(rgba[:, 3], np.clip(alpha[triangle] + rim[triangle] * (1 - facing) ** 2, 0, 1))
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 999), spread=st.floats(1, 300))
+def test_marked_tiles_are_those_that_boxes_meet(seed: int, spread: float) -> None:
+    rng = np.random.default_rng(seed)
+    pixels, faces = rng.uniform(-60, 160, (1, 2)) + rng.normal(size=(20, 2)) * spread, rng.integers(0, 20, (15, 3))
+    rows, columns, tile, margin = 9, 12, 8, 1.5
+    tiles = np.zeros((rows, columns), bool)
+    mark_tiles(pixels, faces, margin, tile, tiles)
+    low, high = pixels[faces].min(axis=1) - margin, pixels[faces].max(axis=1) + margin
+    left, top = np.arange(columns) * tile, np.arange(rows) * tile
+    across = (low[:, :1] < left + tile) & (high[:, :1] >= left)
+    down = (low[:, 1:] < top + tile) & (high[:, 1:] >= top)
+    np.testing.assert_array_equal(tiles, (down[:, :, None] & across[:, None, :]).any(axis=0))
