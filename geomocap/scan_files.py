@@ -16,6 +16,7 @@ from geomocap.open3d_files import check_ply, read_by_open3d
 MESH_ENDINGS = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 CLOUD_ENDINGS = (".ply", ".pcd", ".xyz", ".pts")
 ARRAY_ENDINGS = (".npz", ".npy")
+SCAN_ENDINGS = tuple(sorted({*MESH_ENDINGS, *CLOUD_ENDINGS, *ARRAY_ENDINGS}))
 _TRACKS = {"positions", "start", "end"}  # what tells `tracks.npz` of a run
 
 

@@ -22,8 +22,7 @@ from geomocap.errors import GeometryError
 from geomocap.files import fingerprint
 from geomocap.scan_files import (
     ARRAY_ENDINGS,
-    CLOUD_ENDINGS,
-    MESH_ENDINGS,
+    SCAN_ENDINGS,
     Places,
     Surface,
     holds_tracks,
@@ -181,10 +180,9 @@ def open_scans(source: Path, settings: ScanSettings) -> Scans:
 
 def _sequence(folder: Path) -> list[Path]:
     """List a folder's scans in the order of their numbers; refuse what is not one sequence."""
-    known = {*MESH_ENDINGS, *CLOUD_ENDINGS, *ARRAY_ENDINGS}
-    files = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in known and not p.name.startswith(".")]
+    files = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in SCAN_ENDINGS and not p.name.startswith(".")]
     if not files:
-        raise GeometryError(f"{folder}: holds no scans ({', '.join(sorted(e[1:] for e in known))})")
+        raise GeometryError(f"{folder}: holds no scans ({', '.join(e[1:] for e in SCAN_ENDINGS)})")
     formats = sorted({p.suffix.lower()[1:] for p in files})
     if len(formats) > 1:
         raise GeometryError(f"{folder}: holds scans of several formats ({', '.join(formats)}); keep one of them")

@@ -175,7 +175,7 @@ def sheet(
 
 def write_png(path: Path, image: np.ndarray) -> None:
     """Write an image (H, W, 3) uint8 RGB as PNG, whole or not at all."""
-    write_atomic(path, lambda p: Image.fromarray(image).save(p, optimize=False, compress_level=6))
+    write_atomic(path, lambda p: Image.fromarray(image).save(p, optimize=False, compress_level=4))
 
 
 def jpeg(image: np.ndarray, quality: int = 88) -> bytes:

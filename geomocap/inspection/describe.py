@@ -10,8 +10,9 @@ from geomocap.inspection.captures import describe_capture
 from geomocap.inspection.description import Description
 from geomocap.inspection.motion_files import ENDINGS, describe_motion_file
 from geomocap.inspection.runs import describe_run
-from geomocap.inspection.scans import SCAN_ENDINGS, describe_scans
+from geomocap.inspection.scans import describe_scans
 from geomocap.inspection.truths import describe_truth
+from geomocap.scan_files import SCAN_ENDINGS
 
 
 class InspectionError(GeomocapError):

@@ -9,11 +9,9 @@ import numpy as np
 from geomocap.errors import GeomocapError
 from geomocap.inspection.captures import MOST_NAMED
 from geomocap.inspection.description import Description, count
-from geomocap.scan_files import ARRAY_ENDINGS, CLOUD_ENDINGS, MESH_ENDINGS, Surface
+from geomocap.scan_files import Surface
 from geomocap.scan_tracks import scan_tracks
 from geomocap.scans import Scans, ScanSettings, open_scans
-
-SCAN_ENDINGS = tuple(sorted({*MESH_ENDINGS, *CLOUD_ENDINGS, *ARRAY_ENDINGS}))
 
 
 def describe_scans(path: Path) -> Description:

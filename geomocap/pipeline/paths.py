@@ -70,14 +70,10 @@ def point_paths(job: Job, geometry: Geometry) -> MotionPaths | None:
     Raises
     ------
     GeometryError
-        If these paths are asked for, and there are no scans or they have no points in common.
+        If these paths are asked for, and the scans have no points in common.
     """
     wanted = job.config.segmentation.paths
-    if wanted not in ("auto", "points"):
-        return None
-    if not isinstance(geometry, Scans):
-        if wanted == "points":
-            raise GeometryError("segmentation.paths = points is for scans; of a capture take auto, patches or nodes")
+    if wanted not in ("auto", "points") or not isinstance(geometry, Scans):
         return None
     tracks = scan_tracks(geometry, wanted == "points" or geometry.tracked, job.progress)
     return None if tracks is None else MotionPaths(tracks[spread_out(tracks, SAMPLES)])

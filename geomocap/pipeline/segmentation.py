@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from geomocap.articulation.model import MODEL_FILE
+from geomocap.errors import SettingsError
 from geomocap.geometry import BodyPoints, Geometry
 from geomocap.pipeline.clouds import bounds_of
 from geomocap.pipeline.derived import FROM_BODIES
@@ -24,8 +25,10 @@ from geomocap.skeleton.skeleton import skeleton_m3
 
 def segment(job: Job, source: Source) -> str:
     """Find ellipsoids, bodies and skeleton; return the stage's key."""
-    geometry, source_key = geometry_of(job, source)
     config = job.config
+    if job.capture is not None and config.segmentation.paths == "points":
+        raise SettingsError("segmentation.paths = points is for scans; of a capture take auto, patches or nodes")
+    geometry, source_key = geometry_of(job, source)
     if job.model is not None:
         return segment_with_model(job, geometry, source_key)
     by_motion = config.segmentation.method == "motion" and len(geometry) > 1

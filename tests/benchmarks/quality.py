@@ -77,10 +77,7 @@ CASES = {
     "dilated by a pixel": Case(man, change=give_silhouettes(1)),
     "another seed": Case(man, flags=("--tracking.seed", "1", "--nodes.seed", "1")),
     "frames reversed": Case(man, change=reverse),
-    "horse walking": Case(horse("Walk")),
-    "horse turning": Case(horse("Turn_Left")),
-    "horse rearing": Case(horse("Rear")),
-    "horse kicking": Case(horse("Kick")),
+    **{name: Case(subject) for name, subject in SUBJECTS.items() if name.startswith("horse")},
     "mechanism": Case(mechanism),
     "figure running, 2.5 m/s": Case(runner),
     "spider": Case(spider),
@@ -88,7 +85,7 @@ CASES = {
     "fan": Case(fan),
     "figure, 4 cameras 320×240, 15 fps": Case(figure, {"cameras": 4, "width": 320, "height": 240, "fps": 15}),
     "figure, 4 cameras": Case(figure, {"cameras": 4}),
-    "horse walking, 4 cameras": Case(horse("Walk"), {"cameras": 4}),
+    "horse walking, 4 cameras": Case(SUBJECTS["horse walking"], {"cameras": 4}),
     "man walking, 4 cameras": Case(man, {"cameras": 4}),
     "man walking, volumes only": Case(
         man, flags=("--source", "voxels", "--segmentation.paths", "nodes", "--nodes.colors", "false")

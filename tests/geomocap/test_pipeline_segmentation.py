@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 
+from geomocap.capture import Capture
 from geomocap.config import load_config
+from geomocap.errors import SettingsError
 from geomocap.export.trc import read_trc
 from geomocap.pipeline import Job, motion_files, segment
 from geomocap.pipeline.derived import KEYPOINT_FILES
@@ -53,6 +59,15 @@ def test_points_that_scans_have_in_common_are_followed(job):
     scans = job(scanned(12), {**SETTINGS, "segmentation": {"paths": "nodes"}})
     segment(scans, "scans")
     assert scans.run.read_npz("diagnostics.npz")["paths"] == "nodes"
+
+
+@pytest.mark.parametrize("model", [None, Path("model.npz")])
+def test_a_capture_has_no_points_in_common(job, model):
+    asked = job(scanned(2), {"segmentation": {"paths": "points"}})
+    asked = replace(asked, scans=None, capture=Mock(spec=Capture), model=model)
+    with pytest.raises(SettingsError, match=r"segmentation\.paths = points is for scans; of a capture take auto"):
+        segment(asked, "voxels")
+    assert not asked.run.path.exists(), "refused before anything is made"
 
 
 def follow(run: Run, frames: int) -> None:

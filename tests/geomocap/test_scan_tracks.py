@@ -116,12 +116,12 @@ def test_scans_with_other_numbers_of_points_are_named(tmp_path):
         scan_tracks(scans, certain=True)
 
 
-def test_points_of_a_single_body_and_of_no_scans(tmp_path):
+def test_too_few_points_to_tell_bodies_by(tmp_path):
     (tmp_path / "scans").mkdir()
     scans = scans_of([BALL.vertices[:5]] * 2, tmp_path / "scans")
     assert scan_tracks(scans) is None, "too few to tell"
     with threads(1) as executor:
         config = load_config(overrides={"segmentation": {"paths": "points"}})
         job = Job(Run(tmp_path / "run"), config, executor, scans=scans)
-        with pytest.raises(GeometryError, match="5 "):
+        with pytest.raises(GeometryError, match="motion paths: 5 samples; at least 20 are needed"):
             segment(job, "scans")
