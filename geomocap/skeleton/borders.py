@@ -41,6 +41,11 @@ class Border:
         """Middle of the border, (3,), metres, world, frame 0."""
         return 0.5 * (self.sides[0].mean(axis=0) + self.sides[1].mean(axis=0))
 
+    @property
+    def spread(self) -> float:
+        """Root mean square distance of the border's samples from its middle, metres."""
+        return float(np.sqrt(((np.concatenate(self.sides) - self.middle) ** 2).sum(axis=1).mean()))
+
     def middle_along(self, point: np.ndarray, axis: np.ndarray) -> np.ndarray:
         """Where on a hinge's axis the joint is, (3,), metres: the motion leaves that open, the bodies' shapes say it.
 

@@ -10,6 +10,7 @@ from geomocap.segmentation.rigid_motions import turn_angles
 from geomocap.segmentation.rotations import nearest_rotation
 
 _ROUNDS = 6
+_INDEPENDENT = 0.2  # share of the frames; neighbouring ones err together
 _LEAST_SPREAD = 1e-4
 
 
@@ -53,13 +54,15 @@ def common_point(
     weights: np.ndarray,
     interface: np.ndarray,
     prior: float,
+    spread: float,
     noise: float,
     hinge_share: float,
 ) -> CommonPoint:
-    """Least squares point c with R_a c + t_a = R_b c + t_b in all frames, drawn weakly to the bodies' interface.
+    """Least squares point c with R_a c + t_a = R_b c + t_b in all frames, drawn to the bodies' interface.
 
     Frames count less, the more they miss (weights 1 / (1 + (r / 2s)²), s the median). The prior is worth `prior` frames
-    in which the bodies turn by a radian; it decides along the axis of a hinge, where every point is common.
+    in which the bodies turn by a radian; it decides along the axis of a hinge, where every point is common. It is worth
+    more where the motions miss so much that they know the point less well than the interface does.
 
     Parameters
     ----------
@@ -71,7 +74,9 @@ def common_point(
     interface : (3,) float, metres
         Where the bodies touch in frame 0.
     prior : float
-        Weight of the interface, in frames.
+        Least weight of the interface, in frames.
+    spread : float, metres
+        How far from the middle of the interface a joint may be, standard deviation.
     noise : float, metres
         Misses below this are all the same.
     hinge_share : float
@@ -81,15 +86,20 @@ def common_point(
     apart = translations[1] - translations[0]
     robust = np.array(weights, float)
     total = max(float(weights.sum()), 1e-9)
-    for _ in range(_ROUNDS):
-        normal = np.einsum("t,tji,tjk->ik", robust, turned, turned) / total + prior * np.eye(3)
-        right = np.einsum("t,tji,tj->i", robust, turned, apart) / total + prior * interface
-        point = np.linalg.solve(normal, right)
+    independent = max(_INDEPENDENT * total, 1.0)
+    point = interface
+    for k in range(_ROUNDS + 1):
         miss = np.linalg.norm(turned @ point - apart, axis=1)
         scale = 2.0 * max(_weighted_median(miss, weights), noise)
         robust = weights / (1.0 + (miss / scale) ** 2)
-    rms = float(np.sqrt((robust * miss**2).sum() / max(robust.sum(), 1e-9)))
-    covariance = np.linalg.inv(normal) * max(rms, noise) ** 2 / max(0.2 * total, 1.0)  # frames depend on each other
+        rms = float(np.sqrt((robust * miss**2).sum() / max(robust.sum(), 1e-9)))
+        if k == _ROUNDS:
+            break
+        held = max(prior, max(rms, noise) ** 2 / (independent * spread**2))
+        normal = np.einsum("t,tji,tjk->ik", robust, turned, turned) / total + held * np.eye(3)
+        right = np.einsum("t,tji,tj->i", robust, turned, apart) / total + held * interface
+        point = np.linalg.solve(normal, right)
+    covariance = np.linalg.inv(normal) * max(rms, noise) ** 2 / independent
     axis, off_axis, axis_std = _hinge_axis(rotations, weights)
     relative = turn_angles(rotations[0].swapaxes(1, 2) @ rotations[1])
     turn = float(np.quantile(relative, 0.98))

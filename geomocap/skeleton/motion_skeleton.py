@@ -142,13 +142,12 @@ def possible_connections(bodies: MotionBodies, settings: MotionSkeletonSettings)
         )
         reliability = np.minimum(bodies.reliability[:, a], bodies.reliability[:, b]) + 1e-3
         interface = border.middle
-        joint = common_point(*motions, reliability, interface, settings.interface_prior, noise, settings.hinge_share)
+        certainty = (settings.interface_prior, border.spread, noise, settings.hinge_share)
+        joint = common_point(*motions, reliability, interface, *certainty)
         if joint.hinge:
             # every point of its axis is common: the joint is in the middle of what the bodies share of it
             interface = border.middle_along(joint.point, joint.axis)
-            joint = common_point(
-                *motions, reliability, interface, settings.interface_prior, noise, settings.hinge_share
-            )
+            joint = common_point(*motions, reliability, interface, *certainty)
         off = float(np.linalg.norm(joint.point - interface))
         share = float(contact[a, b] / min(whole[a], whole[b]))
         cost = connection_cost(joint.miss, off, border.gap, share, weights)

@@ -336,7 +336,7 @@ def test_common_point_of_two_motions_and_its_kind():
         start = rng.normal(scale=0.2, size=(40, 3))
         translations = start, start + rotations[0] @ point - rotations[1] @ point
         near = point + (np.array([0.0, 0.06, 0.08]) if hinge else np.array([0.1, 0.0, 0.0]))
-        joint = common_point(rotations, translations, np.ones(40), near, 1e-6, 1e-4, 0.1)
+        joint = common_point(rotations, translations, np.ones(40), near, 1e-6, 1.0, 1e-4, 0.1)
         assert joint.hinge == hinge
         if hinge:  # along the axis the prior decides
             np.testing.assert_allclose(joint.point, near, atol=1e-4)
@@ -344,6 +344,21 @@ def test_common_point_of_two_motions_and_its_kind():
             assert joint.std[2] > 10 * joint.std[0]
         else:
             np.testing.assert_allclose(joint.point, point, atol=1e-4)
+
+
+def test_joint_of_motions_that_do_not_tell_stays_at_the_interface():
+    rng = np.random.default_rng(2)
+    turns = Rotation.from_rotvec(rng.normal(scale=0.05, size=(40, 3)))  # hardly any, and the bodies come apart
+    rotations = np.broadcast_to(np.eye(3), (40, 3, 3)), turns.as_matrix()
+    near = np.array([0.2, 0.1, 1.0])
+    apart = rng.normal(scale=0.05, size=(40, 3)) + np.array([0.3, 0.0, 0.0]) * rng.normal(size=(40, 1))
+    translations = np.zeros((40, 3)), near - rotations[1] @ near + apart
+
+    def away(spread: float) -> float:
+        joint = common_point(rotations, translations, np.ones(40), near, 0.0, spread, 1e-4, 0.1)
+        return float(np.linalg.norm(joint.point - near))
+
+    assert away(1e3) > 0.5 and away(0.05) < 0.05
 
 
 def test_completion_carries_gaps_with_the_neighbours(three):
