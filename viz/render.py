@@ -87,6 +87,7 @@ def _surfaces(meshes: Sequence[Mesh]) -> _Surfaces | None:
     scene.add_triangles(
         o3d.core.Tensor.from_numpy(vertices.astype(np.float32)), o3d.core.Tensor.from_numpy(faces.astype(np.uint32))
     )
+    _cast(scene, np.zeros(3), np.ones((1, 3)))  # the first ray sorts the triangles: views may be rendered side by side
     return _Surfaces(
         scene,
         faces,

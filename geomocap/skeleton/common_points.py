@@ -95,7 +95,7 @@ def common_point(
         rms = float(np.sqrt((robust * miss**2).sum() / max(robust.sum(), 1e-9)))
         if k == _ROUNDS:
             break
-        held = max(prior, max(rms, noise) ** 2 / (independent * spread**2))
+        held = max(prior, max(rms, noise) ** 2 / (independent * max(spread, noise) ** 2))
         normal = np.einsum("t,tji,tjk->ik", robust, turned, turned) / total + held * np.eye(3)
         right = np.einsum("t,tji,tj->i", robust, turned, apart) / total + held * interface
         point = np.linalg.solve(normal, right)
