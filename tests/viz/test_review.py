@@ -157,11 +157,12 @@ def test_results_read_what_was_written(made: Made) -> None:
 def test_overlay_lies_on_the_photographed_figure(made: Made) -> None:
     """The figure was drawn through the distorted cameras; its rendering must fall on the same pixels."""
     from viz.palette import body_color
+    from viz.render import Model
     from viz.scene import body_skin
 
     results = Results(made.run, made.capture)
     red = body_skin(results, 3).recolored((255, 0, 0))
-    changed = overlay(results, "cam1", 3, [red], 160).astype(int)
+    changed = overlay(results, "cam1", 3, Model([red]), 160).astype(int)
     painted = changed[..., 0] - changed[..., 1] > 60
     mask = results.silhouette("cam1", 3)
     assert mask is not None
