@@ -27,16 +27,18 @@ lint: .stamps/dev
 bench: .stamps/dev
 	$(BIN)/python -m tests.benchmarks
 
+# Python compiles what is used when it is used first; the tests use most of it, in many processes
+# (a few packages bring files for other versions of Python, which can't be compiled).
 .stamps/core: pyproject.toml tools/system_packages.sh
 	tools/system_packages.sh
 	"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11) and "geomocap needs Python 3.11 or newer: make PYTHON=/path/to/python3.11 …")'
 	"$(PYTHON)" -m venv $(VENV)
-	$(BIN)/pip install -q --no-compile -e .  # Python compiles what is used when it is used first
+	$(BIN)/pip install -q --no-compile -e .
 	mkdir -p .stamps && touch $@
 
 .stamps/dev: .stamps/core
 	$(BIN)/pip install -q --no-compile -e '.[dev]'
-	$(BIN)/python -m compileall -q -j 0 $(VENV)/lib || true  # some packages bring files for other versions of Python
+	$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true
 	touch $@
 
 clean:

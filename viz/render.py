@@ -14,7 +14,7 @@ import numpy as np
 import open3d as o3d
 
 from viz.ray_kernels import mark_tiles, shade
-from viz.shapes import Mesh
+from viz.shapes import EMPTY, Mesh
 from viz.views import View
 
 PAPER = (255, 255, 255)
@@ -101,6 +101,7 @@ def _surfaces(meshes: Sequence[Mesh]) -> _Surfaces | None:
 
 def _triangles(meshes: Sequence[Mesh]) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) and triangles (F, 3) of all meshes."""
+    meshes = meshes or [EMPTY]
     starts = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
     faces = np.concatenate([m.faces + s for m, s in zip(meshes, starts, strict=True)])
     return np.concatenate([m.vertices for m in meshes]), np.ascontiguousarray(faces)
@@ -117,6 +118,7 @@ class Model:
 
     def __init__(self, meshes: Sequence[Mesh]) -> None:
         self.meshes = [m for m in meshes if len(m.faces)]
+        self._triangles = _triangles(self.meshes)
         self._opaque = _surfaces([m for m in self.meshes if m.alpha >= 1])
         self._clear = _surfaces([m for m in self.meshes if m.alpha < 1])
 
@@ -137,7 +139,7 @@ class Model:
         look = look or Look()
         width, height = view.size
         result = np.zeros((height, width, 4), np.float32)
-        touched = _touched(self.meshes, view)
+        touched = _touched(*self._triangles, view)
         rows, columns = np.flatnonzero(touched.any(axis=1)), np.flatnonzero(touched.any(axis=0))
         if len(rows) == 0:
             return Layer(result)
@@ -186,12 +188,11 @@ class _Rays:
         return picture
 
 
-def _touched(meshes: Sequence[Mesh], view: View) -> np.ndarray:
+def _touched(vertices: np.ndarray, faces: np.ndarray, view: View) -> np.ndarray:
     """Pixels (H, W) bool on which a triangle may fall: those of the 8 × 8 tiles that its box meets, and their edges."""
     width, height = view.size
-    if not meshes:
+    if not len(faces):
         return np.zeros((height, width), bool)
-    vertices, faces = _triangles(meshes)
     pixels, depth = view.project(vertices)
     if (depth <= 1e-6).any() or not np.isfinite(pixels).all():
         return np.ones((height, width), bool)  # something reaches behind the view

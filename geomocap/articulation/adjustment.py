@@ -205,10 +205,10 @@ def _system(
         some = slice(low, min(low + _CHUNK, frames))
         part = bodies.part(some)
         threads = numba.get_num_threads()
-        numba.set_num_threads(threads if some.stop - some.start > _FEW else 1)
-        unknowns = size + shared
-        matrix, sides = np.zeros((len(part.rotations), unknowns, unknowns)), np.zeros((len(part.rotations), unknowns))
-        costs = np.empty(len(part.rotations))
+        count = some.stop - some.start
+        numba.set_num_threads(threads if count > _FEW else 1)
+        matrix, sides = np.zeros((count, size + shared, size + shared)), np.zeros((count, size + shared))
+        costs = np.empty(count)
         try:
             normal_equations(
                 part.rotations,

@@ -32,7 +32,7 @@ class MotionSkeletonSettings(Settings):
     interface_prior: float = Field(
         default=0.005,
         gt=0,
-        description="weight of the place where bodies touch (frames in which they turn by a radian)",
+        description="least weight of the place where bodies touch (frames in which they turn by a radian)",
     )
     hinge_share: float = Field(
         default=0.1, ge=0, lt=1, description="hinge: turns about other axes are less than this share of all (0..1)"

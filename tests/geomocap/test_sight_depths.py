@@ -10,9 +10,20 @@ from geomocap.segmentation import sight_depths
 from geomocap.segmentation.motion_bodies import MotionBodies, MotionBodiesSettings, find_motion_bodies
 from geomocap.segmentation.motion_paths import MotionPaths
 from geomocap.segmentation.sight_depths import find_bodies_and_depths, place_samples, settle_depths
+from geomocap.segmentation.skin_blending import solve_symmetric
 from tests.geomocap.moving_chains import chain, same_partition, seen_by_single_cameras
 
 DEPTH_SHARE = 0.05
+
+
+def test_small_systems_are_solved_as_numpy_does():
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        sights = rng.normal(size=(4, 3))
+        N, b = sights.T @ sights + 0.01 * np.eye(3), rng.normal(size=3)
+        expected = np.linalg.solve(N, b)
+        solve_symmetric(N, b, b)  # in place
+        assert_allclose(b, expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.fixture(scope="module")
