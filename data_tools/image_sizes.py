@@ -74,7 +74,7 @@ def measure_fits(image: np.ndarray, reference: np.ndarray, fits: dict[str, Image
     """Compare an image with a picture of the same view in the calibrated size.
 
     Features are matched between the two (SIFT, D. Lowe 2004); each way in which the one may have become the other
-    gets the share of the matches that it explains to 1.5 pixels.
+    gets the fraction of the matches that it explains to 1.5 pixels.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def measure_fits(image: np.ndarray, reference: np.ndarray, fits: dict[str, Image
 
     Returns
     -------
-    shares : dict of str to float
+    fractions : dict of str to float
         0 … 1.
     matches : int
     """
@@ -97,11 +97,11 @@ def measure_fits(image: np.ndarray, reference: np.ndarray, fits: dict[str, Image
     pairs = [p for p in cv2.BFMatcher().knnMatch(descriptors[0], descriptors[1], k=2) if len(p) == 2]
     good = [a for a, b in pairs if a.distance < 0.7 * b.distance]
     seen, expected = points[0][[m.queryIdx for m in good]], points[1][[m.trainIdx for m in good]]
-    shares = {}
+    fractions = {}
     for name, fit in fits.items():
         off = np.linalg.norm(fit.apply(expected) - seen, axis=1)
-        shares[name] = float(np.mean(off < AGREEMENT)) if len(good) else 0.0
-    return shares, len(good)
+        fractions[name] = float(np.mean(off < AGREEMENT)) if len(good) else 0.0
+    return fractions, len(good)
 
 
 def has_black_bars(image: np.ndarray, fit: ImageFit) -> bool:
@@ -149,11 +149,11 @@ def find_fit(
     if mode != "auto":
         return mode, fits[mode], "as asked for"
     if reference is not None and (reference.shape[1], reference.shape[0]) == tuple(calibrated):
-        shares, matches = measure_fits(image, reference, fits)
-        best = max(shares, key=lambda n: shares[n])
-        listed = ", ".join(f"{n} {100 * s:.0f} %" for n, s in shares.items())
-        if matches >= 30 and shares[best] >= 0.4:
-            return best, fits[best], f"explains {100 * shares[best]:.0f} % of {matches} features ({listed})"
+        fractions, matches = measure_fits(image, reference, fits)
+        best = max(fractions, key=lambda n: fractions[n])
+        listed = ", ".join(f"{n} {100 * s:.0f} %" for n, s in fractions.items())
+        if matches >= 30 and fractions[best] >= 0.4:
+            return best, fits[best], f"explains {100 * fractions[best]:.0f} % of {matches} features ({listed})"
         if matches >= 30:
             raise CalibrationError(
                 f"nothing explains how an image of {actual[0]}×{actual[1]} came from the calibrated "

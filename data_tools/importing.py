@@ -15,13 +15,13 @@ from data_tools.calibration_files import read_pose2sim, read_qualisys
 from data_tools.image_sizes import SizeMismatch, find_fit, refit_camera
 from data_tools.plates import compose_plate
 from data_tools.synthesize import write_png
-from geomocap.cameras import Rig
-from geomocap.capture import Capture, CaptureInfo, write_capture_info
 from geomocap.errors import CalibrationError, CaptureError, GeomocapError
-from geomocap.files import write_atomic
-from geomocap.image_files import IMAGE_ENDINGS, read_image
+from geomocap.files.atomic import write_atomic
+from geomocap.files.capture import Capture, CaptureInfo, write_capture_info
+from geomocap.files.images import IMAGE_ENDINGS, read_image
+from geomocap.files.videos import VIDEO_ENDINGS, Video
+from geomocap.model.rig import Rig
 from geomocap.progress import Progress, silent
-from geomocap.video_files import VIDEO_ENDINGS, Video
 
 PLATE_FRAMES = 25  # frames of a video that a plate is composed from
 

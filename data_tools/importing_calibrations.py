@@ -18,11 +18,11 @@ from data_tools.calibration_files import (
     write_opencv,
     write_pose2sim,
 )
-from geomocap.cameras import Rig
-from geomocap.capture import CaptureInfo, write_capture_info
 from geomocap.errors import CalibrationError
-from geomocap.image_files import IMAGE_ENDINGS
-from geomocap.video_files import VIDEO_ENDINGS, Video
+from geomocap.files.capture import CaptureInfo, write_capture_info
+from geomocap.files.images import IMAGE_ENDINGS
+from geomocap.files.videos import VIDEO_ENDINGS, Video
+from geomocap.model.rig import Rig
 
 Format = Literal["aniposelib", "caliscope", "pose2sim", "opencv", "easymocap", "colmap"]
 

@@ -6,8 +6,8 @@ import numpy as np
 import pycolmap
 from scipy.spatial import ConvexHull, QhullError
 
-from data_tools.views import framing_distance
-from geomocap.cameras import Rig
+from data_tools.camera_views import framing_distance
+from geomocap.model.rig import Rig
 
 
 def camera_names(count: int) -> tuple[str, ...]:
@@ -66,7 +66,7 @@ def place_cameras(
     distance : float, optional
         From the middle of the subject, metres; for each camera as near as `fill` allows if not given.
     fill : float
-        Share of the half width and height of the image within which the subject stays.
+        Fraction of the half width and height of the image within which the subject stays.
     """
     low, high = points.min(axis=0), points.max(axis=0)
     middle, top = (low + high) / 2, float(high[2])

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from data_tools.camera_views import CameraView
 from data_tools.solid_noise import gradient_noise
-from data_tools.views import View
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Light:
         return np.array([*self.key_direction, *self.fill_direction, self.ambient, self.key, self.fill])
 
     @property
-    def key_share_on_floor(self) -> float:
+    def key_fraction_on_floor(self) -> float:
         """How much of the floor's light a full shadow of the key light takes away."""
         key = self.key * max(0.0, self.key_direction[2])
         return float(key / (key + self.ambient + self.fill * max(0.0, self.fill_direction[2])))
@@ -66,11 +66,11 @@ class Room:
     high: np.ndarray
     seed: int = 0
 
-    def render(self, view: View, light: Light, samples: int = 3) -> np.ndarray:
+    def render(self, view: CameraView, light: Light, samples: int = 3) -> np.ndarray:
         """Render the empty room, antialiased with `samples`² rays a pixel: (H, W, 3) float32, grey levels."""
         return _render(view.corners, view.origin, self.low, self.high, light.vector, samples, self.seed)
 
-    def floor_positions(self, view: View) -> np.ndarray:
+    def floor_positions(self, view: CameraView) -> np.ndarray:
         """Where each pixel's centre meets the floor: (H, W, 2) float32, metres, NaN where it meets a wall."""
         width, height = view.size
         rays = view.rays(np.arange(width * height), 1)[:, 0].astype(np.float64)

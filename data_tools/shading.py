@@ -12,11 +12,11 @@ from data_tools.asset import AnimatedAsset
 from data_tools.solid_noise import fabric_noise, gradient_noise
 
 MEAN_LEVEL = 125.0  # grey levels, of the subject under light of strength 1
-DARKEST, BRIGHTEST = 0.08, 0.85  # shares of the light that black and white surfaces return, so that both show fabric
+DARKEST, BRIGHTEST = 0.08, 0.85  # fractions of the light that black and white surfaces return, so that both show fabric
 
 
 @dataclass(frozen=True)
-class Surface:
+class ShadedSurface:
     """What of an asset's appearance stays the same over time, in the form that the kernel takes.
 
     Attributes
@@ -53,7 +53,7 @@ class Surface:
     seed: int
 
     @classmethod
-    def of(cls, asset: AnimatedAsset, footprint: float, contrast: float, seed: int) -> Surface:
+    def of(cls, asset: AnimatedAsset, footprint: float, contrast: float, seed: int) -> ShadedSurface:
         """Prepare an asset for cameras that see it with a pixel every `footprint` metres.
 
         The fabric's finest octave has cells of 2.5 pixels: features of about 4 pixels, which least squares matching
@@ -102,7 +102,7 @@ class Surface:
         )
         return surface._exposed(area)
 
-    def _exposed(self, area: np.ndarray) -> Surface:
+    def _exposed(self, area: np.ndarray) -> ShadedSurface:
         """Return the surface with the exponent that makes its mean colour a good middle grey."""
         n = len(self.faces)
         flat = replace(self, weights=np.zeros_like(self.weights))

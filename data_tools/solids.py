@@ -17,7 +17,7 @@ class Solid:
     faces : (F, 3) int, outward
     uv : (V, 2) float
     normals_group : (V,) int
-        Vertices with the same number share a smooth normal.
+        Vertices with the same number fraction a smooth normal.
     """
 
     vertices: np.ndarray
@@ -40,8 +40,8 @@ def capsule(length: float, radius: tuple[float, float], width: float = 1.0, ring
     """
     angles = np.linspace(0, np.pi / 2, rings)
     profile = [(radius[0] * np.sin(a), radius[0] * np.cos(a)) for a in angles]
-    for share in np.linspace(0, 1, 6)[1:-1]:
-        profile.append(((1 - share) * radius[0] + share * radius[1], -share * length))
+    for fraction in np.linspace(0, 1, 6)[1:-1]:
+        profile.append(((1 - fraction) * radius[0] + fraction * radius[1], -fraction * length))
     profile += [(radius[1] * np.cos(a), -length - radius[1] * np.sin(a)) for a in angles]
     r, z = np.array(profile).T
     turn = np.linspace(0, 2 * np.pi, sides + 1)  # the last column repeats the first with u = 1

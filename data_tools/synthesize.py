@@ -13,16 +13,16 @@ from pydantic import Field
 
 from data_tools.asset import AnimatedAsset
 from data_tools.bar import BarRecording, record_bar
+from data_tools.camera_views import CameraView
+from data_tools.image_rendering import FloorShadow, PosedSubject, Stage, compose, expose, render_subject
 from data_tools.placement import make_camera, outline, place_cameras
-from data_tools.render import FloorShadow, PosedSubject, Stage, compose, expose, render_subject
 from data_tools.room import Light, Room
-from data_tools.shading import Surface
-from data_tools.video import VideoFile
-from data_tools.views import View
-from geomocap.cameras import Rig
-from geomocap.capture import CaptureInfo, write_capture_info
+from data_tools.shading import ShadedSurface
+from data_tools.video_writing import VideoFile
 from geomocap.errors import CaptureError
-from geomocap.files import write_atomic
+from geomocap.files.atomic import write_atomic
+from geomocap.files.capture import CaptureInfo, write_capture_info
+from geomocap.model.rig import Rig
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads
 from geomocap.settings import Settings
@@ -38,7 +38,7 @@ class SynthesisSettings(Settings):
     frames: int = Field(60, ge=1, description="number of frames")
     start: float = Field(0.0, ge=0, description="time in the clip at which the capture begins (s)")
     subject_height: float | None = Field(
-        None, gt=0, description="vertical extent of the subject at the clip's begin (m); the file's own if not given"
+        None, gt=0, description="vertical diagonal of the subject at the clip's begin (m); the file's own if not given"
     )
     arc_deg: float = Field(360.0, gt=0, le=360, description="arc that the cameras stand on (degrees)")
     hfov_deg: float = Field(45.0, gt=5, lt=120, description="angle of view along the longer image side (degrees)")
@@ -48,18 +48,20 @@ class SynthesisSettings(Settings):
     camera_distance: float | None = Field(
         None, gt=0, description="distance from the subject's middle (m); as near as shows the whole motion if not given"
     )
-    fill: float = Field(0.92, gt=0.05, le=1, description="share of the image within which the motion stays")
+    fill: float = Field(0.92, gt=0.05, le=1, description="fraction of the image within which the motion stays")
     distortion: float = Field(1.0, ge=0, le=3, description="strength of lens distortion; 0: none, 1: mild (k1 ≈ −0.1)")
     noise: float = Field(1.5, ge=0, description="sensor noise, standard deviation (grey levels)")
-    exposure: float = Field(0.03, ge=0, lt=1, description="greatest difference of a camera's exposure (share)")
-    light_drift: float = Field(0.0, ge=0, lt=1, description="slow change of the light over the capture (share)")
+    exposure: float = Field(0.03, ge=0, lt=1, description="greatest difference of a camera's exposure (fraction)")
+    light_drift: float = Field(0.0, ge=0, lt=1, description="slow change of the light over the capture (fraction)")
     shadow: bool = Field(True, description="the subject throws a soft shadow on the floor")
     texture_contrast: float = Field(
         0.28, ge=0, le=1, description="standard deviation of the fabric relative to the subject's brightness"
     )
     bar: int = Field(0, ge=0, description="number of positions of a reference-bar recording; 0: none")
     bar_length: float | None = Field(
-        None, gt=0, description="distance of the bar's targets (m); a third of the volume's largest extent if not given"
+        None,
+        gt=0,
+        description="distance of the bar's targets (m); a third of the volume's largest diagonal if not given",
     )
     withhold_calibration: bool = Field(False, description="write no sparse/ into the capture (the truth has it)")
     video: bool = Field(False, description="write `videos/<camera>.mp4` (H.264, lossy) instead of PNG images")
@@ -104,7 +106,7 @@ def synthesize(
     Parameters
     ----------
     asset : AnimatedAsset
-        From `data_tools.gltf.load_gltf` or `data_tools.figure`.
+        From `data_tools.gltf_reader.load_gltf` or `data_tools.figure`.
     capture, truth : Path
         Folders to write; neither may hold a capture already.
     executor : Executor, optional
@@ -131,7 +133,7 @@ def synthesize(
         )
     vertices = np.array([asset.vertices(t) for t in times])
     world = make_world(vertices, settings)
-    surface = Surface.of(asset, world.footprint, settings.texture_contrast, settings.seed)
+    surface = ShadedSurface.of(asset, world.footprint, settings.texture_contrast, settings.seed)
 
     if executor is None:
         with threads() as own:
@@ -209,7 +211,7 @@ def _record(
     vertices: np.ndarray,
     times: np.ndarray,
     world: World,
-    surface: Surface,
+    surface: ShadedSurface,
     capture: Path,
     truth: Path,
     settings: SynthesisSettings,
@@ -221,7 +223,7 @@ def _record(
 
     # Empty room: rendered once a camera, and photographed once
     def make_stage(c: int) -> Stage:
-        view = View.of(rig, c)
+        view = CameraView.of(rig, c)
         stage = Stage(view, world.room.render(view, light), world.room.floor_positions(view))
         plate = expose(stage.background, world.gains[c], settings.noise, (seed, 2, c))
         write_png(capture / "background" / f"{rig.names[c]}.png", plate)

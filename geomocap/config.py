@@ -7,22 +7,22 @@ from typing import Any
 
 from pydantic import Field
 
-from geomocap.articulation.refinement import RefinementSettings
-from geomocap.articulation.take_tracking import TakeSettings
-from geomocap.carving.settings import CarvingSettings
-from geomocap.cloud.settings import CloudSettings
-from geomocap.export.settings import ExportSettings
-from geomocap.scans import ScanSettings
-from geomocap.segmentation.motion_bodies import MotionBodiesSettings
-from geomocap.segmentation.settings import SegmentationSettings
+from geomocap.bodies.motion_bodies import MotionBodiesSettings
+from geomocap.carving.carving_settings import CarvingSettings
+from geomocap.dense.dense_settings import CloudSettings
+from geomocap.export.export_settings import ExportSettings
+from geomocap.files.scans import ScanSettings
+from geomocap.nodes.node_settings import NodeTrackingSettings
+from geomocap.patches.patch_settings import TrackingSettings
+from geomocap.segmentation.m3_settings import SegmentationSettings
+from geomocap.segmentation.skeleton_settings import SkeletonSettings
 from geomocap.settings import Settings, load_settings
 from geomocap.silhouettes import SilhouetteSettings
 from geomocap.skeleton.motion_skeleton import MotionSkeletonSettings
-from geomocap.skeleton.settings import SkeletonSettings
-from geomocap.tracking.filters import FilterSettings
-from geomocap.tracking.node_settings import NodeTrackingSettings
-from geomocap.tracking.smoothing import SmoothingSettings
-from geomocap.tracking.tracking_settings import TrackingSettings
+from geomocap.skeleton.refinement import RefinementSettings
+from geomocap.subject.model_following import FollowingSettings
+from geomocap.trajectories.filters import FilterSettings
+from geomocap.trajectories.smoothing import SmoothingSettings
 
 
 class Config(Settings):
@@ -41,7 +41,9 @@ class Config(Settings):
     motion_bodies: MotionBodiesSettings = Field(MotionBodiesSettings(), description="bodies from motion paths")
     motion_skeleton: MotionSkeletonSettings = Field(MotionSkeletonSettings(), description="their joints")
     refinement: RefinementSettings = Field(RefinementSettings(), description="refinement of their motion")
-    take: TakeSettings = Field(TakeSettings(), description="following a subject's model through another take")
+    following: FollowingSettings = Field(
+        FollowingSettings(), description="following a subject's model through another sequence"
+    )
     export: ExportSettings = Field(ExportSettings(), description="motion files")
 
 

@@ -1,4 +1,4 @@
-"""What all tests share."""
+"""What all tests fraction."""
 
 from __future__ import annotations
 

@@ -51,7 +51,13 @@ def test_importing_the_library_loads_no_command_line():
 def test_segmentation_sees_points_only():
     for file in (ROOT / "geomocap" / "segmentation").rglob("*.py"):
         text = file.read_text()
-        for source in ("geomocap.geometry", "geomocap.capture", "geomocap.cameras", "geomocap.carving", "open3d"):
+        for source in (
+            "geomocap.model.frame_geometry",
+            "geomocap.files.capture",
+            "geomocap.model.rig",
+            "geomocap.carving",
+            "open3d",
+        ):
             assert f"import {source}" not in text and f"from {source}" not in text, f"{file} knows of {source}"
 
 

@@ -3,7 +3,7 @@
 Everything is rendered by casting rays with Open3D (Embree), so neither a screen nor a graphics stack is needed.
 """
 
-from viz.files import render_file
+from viz.picture_files import render_file
 from viz.review import review
 
 __all__ = ["render_file", "review"]

@@ -8,10 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from geomocap.calibration.calibrate import Calibration
-from geomocap.files import write_atomic
+from geomocap.calibration.bar_calibration import Calibration
+from geomocap.files.atomic import write_atomic
+from viz.body_colors import ACCENT, INK, body_color, hex_color
 from viz.figures import plot
-from viz.palette import ACCENT, INK, body_color, hex_color
 from viz.report import Block, Report, Section, table, text, write_report
 from viz.report import plot as plot_block
 
@@ -129,7 +129,7 @@ def report_of(calibration: Calibration, plots: dict[str, bytes]) -> Report:
     )
     lead = (
         f"{len(n.names)} cameras, calibrated with a bar of {1000 * n.length:.1f} mm moved through a volume of "
-        f"{c.held_out.extent:.2f} m diagonal."
+        f"{c.held_out.diagonal:.2f} m diagonal."
     )
     return Report("Calibration", lead, tuple((value, label) for label, value in figures), sections)
 
@@ -335,7 +335,7 @@ def coverage_maps(calibration: Calibration) -> Figure:
                 fontsize=7,
                 color="#a34708" if count == 0 else "#4a525c",
             )
-        ax.set_xlabel(f"{100 * cover.share:.0f} % of the fields")
+        ax.set_xlabel(f"{100 * cover.fraction:.0f} % of the fields")
     return figure
 
 

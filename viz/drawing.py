@@ -12,8 +12,8 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from geomocap.files import write_atomic
-from viz.palette import INK
+from geomocap.files.atomic import write_atomic
+from viz.body_colors import INK
 
 FAINT = (118, 124, 133)
 """Secondary text, RGB 0–255."""

@@ -10,13 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from geomocap.evaluation import Curve, Evaluation
-from geomocap.evaluation.bodies import LabelledFrame, labelled_frame
+from geomocap.evaluation.body_scores import LabelledFrame, labelled_frame
 from geomocap.evaluation.truth import Truth
+from geomocap.files.run import Run
 from geomocap.progress import Progress, silent
-from geomocap.run import Run
+from viz.body_colors import ACCENT, body_color, hex_color
 from viz.figures import MUTED, plot
 from viz.matching_review import error_sheet, surface_errors
-from viz.palette import ACCENT, body_color, hex_color
 from viz.report import Block, Report, Section, missing, picture, table, text, write_report
 from viz.report import plot as plot_block
 from viz.results import read_points
@@ -183,7 +183,7 @@ def _worst_of(result: Evaluation, start: str) -> int:
 
 
 def _side_axes(vertices: np.ndarray) -> tuple[int, int]:
-    """Return the horizontal axis with the larger extent, and z."""
+    """Return the horizontal axis with the larger diagonal, and z."""
     return int(np.argmax(np.ptp(vertices[:, :2], axis=0))), 2
 
 

@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from viz.palette import ACCENT, INK, body_color, hex_color
-from viz.quality import Bone, Coverage, Paths
+from viz.body_colors import ACCENT, INK, body_color, hex_color
+from viz.quality_figures import Bone, Coverage, PathFigures
 from viz.results import Ellipsoids, Skeleton
 
 P = ParamSpec("P")
@@ -102,7 +102,7 @@ def joint_angles(skeleton: Skeleton, fps: float | None) -> Figure:
 
 
 @plot
-def path_curves(paths: Paths, body: np.ndarray, up: str, fps: float | None) -> Figure:
+def path_curves(paths: PathFigures, body: np.ndarray, up: str, fps: float | None) -> Figure:
     """Plot the relative paths' coordinates and the distance curves to the seed, as in the M3 paper's figure 4."""
     times, label = times_axis(len(paths.relative), fps)
     figure = figure_of(WIDTH, 4.9)
@@ -126,7 +126,7 @@ def path_curves(paths: Paths, body: np.ndarray, up: str, fps: float | None) -> F
 
 
 @plot
-def integrals(paths: Paths, body: np.ndarray) -> Figure:
+def integrals(paths: PathFigures, body: np.ndarray) -> Figure:
     """Plot the integrals of the distance curves: to the seed, sorted, and of all pairs, with the threshold."""
     figure = figure_of(WIDTH, 2.9)
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))
@@ -167,15 +167,15 @@ def counts(numbers: Mapping[str, tuple[Sequence[int], np.ndarray]]) -> Figure:
 
 @plot
 def coverage(cover: Coverage) -> Figure:
-    """Plot the share of each camera's image that the silhouette covers."""
+    """Plot the fraction of each camera's image that the silhouette covers."""
     figure = figure_of(WIDTH, 2.6)
     ax = figure.subplots()
     shades = matplotlib.colormaps["viridis"](np.linspace(0, 0.85, len(cover.cameras)))
-    for camera, share, cut, color in zip(cover.cameras, cover.share, cover.cut, shades, strict=True):
-        ax.plot(cover.frames, 100 * share, color=color, label=camera)
-        ax.plot(cover.frames[cut], 100 * share[cut], ls="", marker="x", ms=4, color=color)
+    for camera, fraction, cut, color in zip(cover.cameras, cover.fraction, cover.cut, shades, strict=True):
+        ax.plot(cover.frames, 100 * fraction, color=color, label=camera)
+        ax.plot(cover.frames[cut], 100 * fraction[cut], ls="", marker="x", ms=4, color=color)
     ax.set_xlabel("frame")
-    ax.set_title("share of the image inside the silhouette (%); × where it reaches the image's border")
+    ax.set_title("fraction of the image inside the silhouette (%); × where it reaches the image's border")
     ax.set_ylim(bottom=0)
     ax.legend(ncols=1, loc="center left", bbox_to_anchor=(1, 0.5))
     return figure

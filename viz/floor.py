@@ -7,27 +7,29 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from viz.render import PAPER
+from viz.rendering import PAPER
 from viz.shapes import Mesh
-from viz.views import PinholeView, Stage
+from viz.viewpoints import PinholeView, ViewStage
 
 LINE = (222, 225, 229)
 SHADE = (120, 126, 135)
 _VERTICES = 40_000  # about as many throw the shadow
 
 
-def grid_spacing(extent: float) -> float:
-    """Return the distance of grid lines, metres: 1, 2 or 5 times a power of ten, about a sixth of the extent."""
-    power = 10.0 ** np.floor(np.log10(max(extent, 1e-6) / 6))
-    return float(max(m for m in (1, 2, 5) if m * power <= extent / 6 + 1e-12) * power)
+def grid_spacing(diagonal: float) -> float:
+    """Return the distance of grid lines, metres: 1, 2 or 5 times a power of ten, about a sixth of the diagonal."""
+    power = 10.0 ** np.floor(np.log10(max(diagonal, 1e-6) / 6))
+    return float(max(m for m in (1, 2, 5) if m * power <= diagonal / 6 + 1e-12) * power)
 
 
-def floor(stage: Stage, view: PinholeView, meshes: Sequence[Mesh] = (), center: np.ndarray | None = None) -> np.ndarray:
+def floor(
+    stage: ViewStage, view: PinholeView, meshes: Sequence[Mesh] = (), center: np.ndarray | None = None
+) -> np.ndarray:
     """Draw the floor as a view sees it: (H, W, 3) uint8, RGB.
 
     Parameters
     ----------
-    stage : Stage
+    stage : ViewStage
     view : PinholeView
     meshes : sequence of Mesh
         What throws the shadow.
@@ -48,10 +50,10 @@ def floor(stage: Stage, view: PinholeView, meshes: Sequence[Mesh] = (), center: 
 
     if meshes:
         _shadow(image, stage, view, meshes, base, basis, scale)
-    step = grid_spacing(stage.extent)
+    step = grid_spacing(stage.diagonal)
     # The grid is fixed to the world: lines are at multiples of the step.
     origin = basis @ base
-    reach = max(0.75 * stage.extent, 2 * step)
+    reach = max(0.75 * stage.diagonal, 2 * step)
     first, last = np.floor((origin - reach) / step), np.ceil((origin + reach) / step)
     segments = []
     for k in range(2):
@@ -75,7 +77,7 @@ def _lines(image: np.ndarray, view: PinholeView, points: np.ndarray, scale: int)
 
 def _shadow(
     image: np.ndarray,
-    stage: Stage,
+    stage: ViewStage,
     view: PinholeView,
     meshes: Sequence[Mesh],
     base: np.ndarray,
@@ -84,12 +86,12 @@ def _shadow(
 ) -> None:
     """Darken the floor below the meshes, the more the nearer they are to it."""
     cells = 160
-    reach = 0.75 * stage.extent
+    reach = 0.75 * stage.diagonal
     vertices = np.concatenate([m.vertices for m in meshes])
     vertices = vertices[:: max(1, len(vertices) // _VERTICES)]
     flat = (vertices - base) @ basis.T
     height = (vertices - base) @ stage.up
-    weight = np.exp(-np.maximum(height, 0) / (0.12 * stage.extent))
+    weight = np.exp(-np.maximum(height, 0) / (0.12 * stage.diagonal))
     index = np.floor((flat / reach + 1) / 2 * cells).astype(int)
     inside = ((index >= 0) & (index < cells)).all(axis=1)
     table = np.zeros((cells, cells), np.float32)

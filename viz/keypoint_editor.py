@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from geomocap.cameras import Rig
 from geomocap.errors import GeomocapError
-from geomocap.export.errors import require
-from geomocap.tracking.keypoint_file import KeyPointFile
+from geomocap.export.export_errors import require
+from geomocap.keypoints.keypoint_regions import KeyPointFile
+from geomocap.model.rig import Rig
 from viz.floor import grid_spacing
 from viz.keypoint_marks import BRIDGED, CHOSEN, LINK, MEASURED
 from viz.keypoint_panel import Panel
@@ -216,7 +216,7 @@ class KeyPointEditor:
         first = self.server.initial_camera
         first.position, first.look_at = -R.T @ t, R.T @ (np.array([0, 0, t[2]]) - t)
         first.up, first.fov = stage.up, np.radians(1.15 * _FIELD_DEG)
-        step = grid_spacing(stage.extent)
+        step = grid_spacing(stage.diagonal)
         size = 12 * step
         plane = {0: "yz", 1: "xz", 2: "xy"}[int(np.argmax(np.abs(stage.up)))]
         middle = stage.centers[0] - stage.up * (stage.centers[0] @ stage.up - stage.floor)
@@ -225,7 +225,7 @@ class KeyPointEditor:
             "/floor", size, size, plane=plane, cell_size=step, section_size=5 * step, shadow_opacity=0, position=middle
         )
         self._handles = scene.add_transform_controls(
-            "/handles", scale=0.08 * stage.extent, disable_rotations=True, depth_test=False, visible=False
+            "/handles", scale=0.08 * stage.diagonal, disable_rotations=True, depth_test=False, visible=False
         )
         self._frusta = {}
         rig = self._rig()

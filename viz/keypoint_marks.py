@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from geomocap.cameras import Rig
+from geomocap.model.rig import Rig
 from viz.drawing import write_on
 
 MEASURED = (0, 150, 120)

@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 
 from geomocap.errors import RunError
 from geomocap.scheduling import map_items, threads
+from viz.body_colors import INK, body_color, hex_color
 from viz.drawing import resize, sheet
 from viz.figures import WIDTH, figure_of, plot, times_axis
 from viz.keypoint_marks import Marks, marked
-from viz.palette import INK, body_color, hex_color
 from viz.results import Results
-from viz.views import Stage
+from viz.viewpoints import ViewStage
 
 _STICKS = 12  # frames whose links are drawn
 _NEEDED = ("names", "positions", "radius")
@@ -42,7 +42,7 @@ def read_marks(results: Results) -> Marks | None:
 
 
 @plot
-def paths(marks: Marks, stage: Stage) -> Figure:
+def paths(marks: Marks, stage: ViewStage) -> Figure:
     """Plot the ways of key-points from the front and from the top, with their links at some moments."""
     ahead = np.cross(stage.up, stage.broad)
     along = [marks.positions @ axis for axis in (stage.broad, stage.up, ahead)]

@@ -10,14 +10,14 @@ from itertools import pairwise
 import matplotlib
 import numpy as np
 
-from geomocap.tracking.keypoint_file import KeyPointFile
-from geomocap.tracking.keypoints import KeyPointPaths
+from geomocap.keypoints.keypoint_following import KeyPointPaths
+from geomocap.keypoints.keypoint_regions import KeyPointFile
+from viz.body_colors import hex_color
 from viz.drawing import resize
 from viz.keypoint_marks import BRIDGED, LOST, MEASURED, Marks, marked
-from viz.palette import hex_color
 from viz.results import Results
 from viz.scene import stage as find_stage
-from viz.views import Stage
+from viz.viewpoints import ViewStage
 from viz.volumes import smooth_normals, spacing
 
 POINTS = 24_000
@@ -36,7 +36,7 @@ _STATE_COLORS = (LOST, BRIDGED, MEASURED)  # of `Marks.states`
 
 
 @dataclass(frozen=True)
-class Surface:
+class SceneSurface:
     """Points of one frame.
 
     Attributes
@@ -51,7 +51,7 @@ class Surface:
     colors: np.ndarray
     spacing: float
 
-    def shaded(self) -> Surface:
+    def shaded(self) -> SceneSurface:
         """Return the points with colours that show the surface's shape: darker where it faces to the side."""
         if len(self.points) < 4:
             return self
@@ -59,13 +59,13 @@ class Surface:
         bright = 255 * (self.colors / 255) ** 0.75
         return replace(self, colors=np.rint(bright * (0.7 + 0.3 * facing)[:, None]).astype(np.uint8))
 
-    def thinned(self, at_most: int) -> Surface:
+    def thinned(self, at_most: int) -> SceneSurface:
         """Return some of the points, the same at every call, spaced accordingly."""
         count = len(self.points)
         if count <= at_most:
             return self
         kept = np.sort(np.random.default_rng(0).permutation(count)[:at_most])
-        return Surface(self.points[kept], self.colors[kept], self.spacing * float(np.sqrt(count / at_most)))
+        return SceneSurface(self.points[kept], self.colors[kept], self.spacing * float(np.sqrt(count / at_most)))
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Subject:
         return self.tracks.shape[1]
 
     @cached_property
-    def stage(self) -> Stage:
+    def stage(self) -> ViewStage:
         """Where the motion takes place."""
         return find_stage(self.results)
 
@@ -100,17 +100,17 @@ class Subject:
         capture = self.results.capture
         return capture.cameras if capture is not None and capture.is_calibrated else ()
 
-    def surface(self, frame: int) -> Surface:
+    def surface(self, frame: int) -> SceneSurface:
         """Return the voxels or the cloud of a frame, else the trajectories' points."""
         if self.results.has("voxels", frame):
             v = self.results.voxels(frame)
-            return Surface(v.points, v.colors, v.voxel_size)
+            return SceneSurface(v.points, v.colors, v.voxel_size)
         if self.results.has("cloud", frame):
             c = self.results.cloud(frame)
-            return Surface(c.positions, c.colors, spacing(c.positions))
+            return SceneSurface(c.positions, c.colors, spacing(c.positions))
         points = self.tracks[:, frame]
         points = points[np.isfinite(points[:, 0])]
-        return Surface(points, np.full(points.shape, 150, np.uint8), spacing(points))
+        return SceneSurface(points, np.full(points.shape, 150, np.uint8), spacing(points))
 
     # --- trails ---
 

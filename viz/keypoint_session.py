@@ -9,9 +9,9 @@ from itertools import count
 import numpy as np
 
 from geomocap.errors import SettingsError
+from geomocap.keypoints.keypoint_following import KeyPointPaths, Measured
+from geomocap.keypoints.keypoint_regions import KeyPoint, KeyPointFile, follow_regions
 from geomocap.settings import check_settings
-from geomocap.tracking.keypoint_file import KeyPoint, KeyPointFile, follow_regions
-from geomocap.tracking.keypoints import KeyPointPaths, Measured
 
 
 @dataclass(frozen=True)

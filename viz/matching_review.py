@@ -8,15 +8,15 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from geomocap.cloud import CloudFrame, TemplateCloud, undistorted_color
 from geomocap.config import load_config
+from geomocap.dense import CloudFrame, TemplateCloud, undistorted_color
 from geomocap.errors import GeomocapError
 from geomocap.matching.growing import SurfaceMatches
-from geomocap.pipeline.clouds import measure_again
+from geomocap.pipeline.cloud_stage import measure_again
+from viz.body_colors import ACCENT, INK, body_color
 from viz.drawing import faded, sheet, text_width, write_on
-from viz.palette import ACCENT, INK, body_color
 from viz.results import Results
-from viz.views import look
+from viz.viewpoints import look
 
 PARTLY = (230, 130, 20)
 """Points that not all search images saw."""
@@ -58,7 +58,7 @@ def matched_picture(image: np.ndarray, surface: SurfaceMatches, width: int = 900
     Parameters
     ----------
     image : (H, W, 3) uint8
-        Template image without distortion (`geomocap.cloud.undistorted_color`).
+        Template image without distortion (`geomocap.dense.undistorted_color`).
     surface : SurfaceMatches
     width : int
         Width of the picture, pixels; the picture is cut to what was matched.

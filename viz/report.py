@@ -12,7 +12,7 @@ from typing import Literal
 import jinja2
 import numpy as np
 
-from geomocap.files import write_text
+from geomocap.files.atomic import write_text
 from viz.drawing import jpeg
 
 EMBEDDED_VIDEO = 6_000_000

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import open3d as o3d
 
-from geomocap.capture import Capture
 from geomocap.errors import GeometryError, RunError
-from geomocap.geometry import Voxels
-from geomocap.image_files import read_image
-from geomocap.open3d_files import read_by_open3d
-from geomocap.run import Run
+from geomocap.files.capture import Capture
+from geomocap.files.images import read_image
+from geomocap.files.open3d_geometry import read_by_open3d
+from geomocap.files.run import Run
+from geomocap.model.frame_geometry import Voxels
 
 KINDS = ("bodies", "voxels", "cloud")
 

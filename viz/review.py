@@ -8,16 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from geomocap.capture import Capture
 from geomocap.errors import GeometryError, RunError
-from geomocap.files import write_atomic
-from geomocap.pipeline.clouds import read_cloud_record
+from geomocap.files.atomic import write_atomic
+from geomocap.files.capture import Capture
+from geomocap.files.run import Run
+from geomocap.pipeline.cloud_stage import read_cloud_record
 from geomocap.progress import Progress, silent
-from geomocap.run import Run
-from viz import figures, keypoint_plots, separation, sheets, tracks
+from viz import figures, keypoint_plots, separation, sheets
+from viz import track_pictures as tracks
 from viz.drawing import write_png
+from viz.films import motion_video
 from viz.matching_review import frame_sheet, measured_frame, template_sheet
-from viz.quality import Quality, assess, relative_paths
+from viz.quality_figures import Quality, assess, relative_paths
 from viz.report import Block, Report, missing, picture, plot, table, text, video, write_report
 from viz.results import Results
 from viz.scene import stage as find_stage
@@ -33,8 +35,7 @@ from viz.sections import (
     timings_table,
     title,
 )
-from viz.video import motion_video
-from viz.views import Stage
+from viz.viewpoints import ViewStage
 
 _FOLLOWED = {
     "patches": "patches of the images",
@@ -152,7 +153,7 @@ def review(
     return [*desk.written, page]
 
 
-def _result(results: Results, stage: Stage | None, frames: list[int], desk: Desk) -> list[Block]:
+def _result(results: Results, stage: ViewStage | None, frames: list[int], desk: Desk) -> list[Block]:
     if stage is None:
         return [missing("The run holds no geometry yet, so there is no result to show; the silhouettes are below.")]
     blocks = []
@@ -180,7 +181,7 @@ def _result(results: Results, stage: Stage | None, frames: list[int], desk: Desk
     return blocks + desk.sheet("stages", sheets.story_sheet(results, stage, frames, rows), "Stage by stage", words)
 
 
-def _inputs(results: Results, stage: Stage | None, frames: list[int], desk: Desk) -> list[Block]:
+def _inputs(results: Results, stage: ViewStage | None, frames: list[int], desk: Desk) -> list[Block]:
     if results.capture is None:
         desk.step()
         return [missing("No capture is at hand (the geometry came from elsewhere), so there are no cameras or images.")]
@@ -199,14 +200,14 @@ def _silhouettes(results: Results, quality: Quality, frames: list[int], desk: De
         return [missing("The run has no silhouettes.")]
     words = (
         "The line should follow the subject's outline, with nothing of it left out: what one camera misses is cut out "
-        "of the volume. The figure is the share of the image inside."
+        "of the volume. The figure is the fraction of the image inside."
     )
     blocks = desk.sheet("silhouettes", image, "Silhouettes", words)
     words = "Even curves are good; a sudden step means that background was taken for the subject, or the reverse."
     return blocks + desk.plot("coverage", figures.coverage(quality.coverage), "Coverage", words)
 
 
-def _volume(results: Results, stage: Stage | None, frames: list[int], desk: Desk) -> list[Block]:
+def _volume(results: Results, stage: ViewStage | None, frames: list[int], desk: Desk) -> list[Block]:
     kind = next((k for k in ("voxels", "cloud") if k in results.kinds), None)
     if stage is None or kind is None:
         return [missing("The run has neither voxels nor a point cloud.")]
@@ -252,7 +253,7 @@ def _clouds(results: Results, frames: list[int], desk: Desk) -> list[Block]:
     return blocks + desk.sheet("cloud_sides", frame_sheet(frame, up=up), f"The cloud of frame {number}", words)
 
 
-def _tracks(results: Results, stage: Stage | None, frames: list[int], desk: Desk) -> list[Block]:
+def _tracks(results: Results, stage: ViewStage | None, frames: list[int], desk: Desk) -> list[Block]:
     found = None if stage is None else tracks.read_tracks(results)
     if stage is None or found is None or not len(found.positions):
         return []
@@ -273,7 +274,7 @@ def _tracks(results: Results, stage: Stage | None, frames: list[int], desk: Desk
     return blocks + desk.sheet("filters", over, f"Filters off and on, frame {middle}", words)
 
 
-def _ellipsoids(results: Results, stage: Stage | None, frames: list[int], desk: Desk) -> list[Block]:
+def _ellipsoids(results: Results, stage: ViewStage | None, frames: list[int], desk: Desk) -> list[Block]:
     e = results.ellipsoids
     if stage is None or e is None:
         return [missing("The run has no ellipsoids.")]
@@ -302,7 +303,7 @@ def _ellipsoids(results: Results, stage: Stage | None, frames: list[int], desk: 
     return blocks
 
 
-def _bodies(results: Results, stage: Stage | None, frames: list[int], desk: Desk) -> list[Block]:
+def _bodies(results: Results, stage: ViewStage | None, frames: list[int], desk: Desk) -> list[Block]:
     if stage is None or "bodies" not in results.kinds:
         return [missing("The run has no rigid bodies.")]
     words = "Each body in its colour, grey what belongs to none. Borders should lie where the subject bends."
@@ -316,7 +317,7 @@ def _bodies(results: Results, stage: Stage | None, frames: list[int], desk: Desk
     return [*blocks, bodies_table(results, middle[0])]
 
 
-def _separation(results: Results, stage: Stage | None, desk: Desk) -> list[Block]:
+def _separation(results: Results, stage: ViewStage | None, desk: Desk) -> list[Block]:
     found = results.diagnostics
     if stage is None or "sample_body" not in found:
         return []
@@ -341,7 +342,9 @@ def _separation(results: Results, stage: Stage | None, desk: Desk) -> list[Block
     return blocks
 
 
-def _skeleton(results: Results, stage: Stage | None, quality: Quality, frames: list[int], desk: Desk) -> list[Block]:
+def _skeleton(
+    results: Results, stage: ViewStage | None, quality: Quality, frames: list[int], desk: Desk
+) -> list[Block]:
     if stage is None or results.skeleton is None:
         return [missing("The run has no skeleton.")]
     words = (
@@ -369,7 +372,7 @@ def _skeleton(results: Results, stage: Stage | None, quality: Quality, frames: l
     return blocks
 
 
-def _keypoints(results: Results, stage: Stage | None, frames: list[int], desk: Desk) -> list[Block]:
+def _keypoints(results: Results, stage: ViewStage | None, frames: list[int], desk: Desk) -> list[Block]:
     marks = keypoint_plots.read_marks(results)
     if stage is None or marks is None:
         return []

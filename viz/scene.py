@@ -6,17 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from viz import palette
+from viz import body_colors as palette
 from viz.results import Results
 from viz.shapes import EMPTY, Mesh, ball, bone, ellipsoid, join, tube
-from viz.views import Stage, stage_of, up_vector
+from viz.viewpoints import ViewStage, stage_of, up_vector
 from viz.volumes import cubes, gems, skin, spacing
 
 GLASS = (128, 146, 168)
 """Colour of the translucent volume, RGB 0–255."""
 
 
-def stage(results: Results, samples: int = 10) -> Stage:
+def stage(results: Results, samples: int = 10) -> ViewStage:
     """Find where a run's motion takes place, from some of its frames.
 
     Raises

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from viz.palette import body_color, hex_color
-from viz.quality import Quality
+from viz.body_colors import body_color, hex_color
+from viz.quality_figures import Quality
 from viz.report import Block, Section, missing, table, text
 from viz.results import Results
 
@@ -86,18 +86,18 @@ def cameras_table(results: Results) -> Block:
 
 
 def bodies_table(results: Results, frame: int) -> Block:
-    """Return the table of bodies: their share of the points, ellipsoids and joints."""
+    """Return the table of bodies: their fraction of the points, ellipsoids and joints."""
     labels = np.asarray(results.bodies(frame).bodies)
     e, s = results.ellipsoids, results.skeleton
     count = int(max(labels.max(initial=-1), -1 if e is None else e.body.max(initial=-1))) + 1
     rows, colors = [], []
     for body in (*range(count), *([-1] if (labels < 0).any() else [])):
-        share = f"{100 * float(np.mean(labels == body)):.1f}"
+        fraction = f"{100 * float(np.mean(labels == body)):.1f}"
         own = "" if e is None else str(int((e.body == body).sum()))
         joints = ""
         if s is not None and body >= 0:
             joints = ", ".join(s.joint_names[j] for j in np.flatnonzero((s.joint_bodies == body).any(axis=1)).tolist())
-        rows.append((f"body {body}" if body >= 0 else "none", share, own, joints))
+        rows.append((f"body {body}" if body >= 0 else "none", fraction, own, joints))
         colors.append(hex_color(body_color(body)))
     return table(("body", f"points in frame {frame} (%)", "ellipsoids", "joints"), rows, (1, 2), colors)
 
@@ -122,15 +122,15 @@ def figures_of_quality(results: Results, quality: Quality) -> list[Block]:
         blocks.append(Block("fine", "Nothing conspicuous was found in what can be judged without ground truth."))
     if quality.coverage is not None:
         rows = []
-        for camera, share, cut in zip(
-            quality.coverage.cameras, quality.coverage.share, quality.coverage.cut, strict=True
+        for camera, fraction, cut in zip(
+            quality.coverage.cameras, quality.coverage.fraction, quality.coverage.cut, strict=True
         ):
             covered, inside = quality.agreement.get(camera, (np.nan, np.nan))
-            spread = f"{100 * np.nanmin(share):.1f} – {100 * np.nanmax(share):.1f}"
+            spread = f"{100 * np.nanmin(fraction):.1f} – {100 * np.nanmax(fraction):.1f}"
             rows.append(
                 (
                     camera,
-                    f"{100 * np.nanmedian(share):.1f}",
+                    f"{100 * np.nanmedian(fraction):.1f}",
                     spread,
                     str(int(cut.sum())),
                     _percent(covered),

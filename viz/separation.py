@@ -8,14 +8,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from viz.body_colors import ACCENT, INK, body_color, body_colors, hex_color
 from viz.drawing import sheet
 from viz.figures import WIDTH, figure_of, plot
-from viz.palette import ACCENT, INK, body_color, body_colors, hex_color
-from viz.render import Model
+from viz.rendering import Model
 from viz.report import Block, table
 from viz.results import Results
 from viz.sheets import VIEWS, picture, tile_size
-from viz.views import Stage
+from viz.viewpoints import ViewStage
 from viz.volumes import gems, spacing
 
 MOST_ALTERNATIVES = 5
@@ -39,24 +39,24 @@ def elimination_curve(bodies: np.ndarray, strengths: np.ndarray, found: int) -> 
 
 
 @plot
-def reliability(share: np.ndarray, fps: float | None) -> Figure:
-    """Plot the share of each body's samples that were measured and follow it, (T, B), over time."""
-    figure = figure_of(WIDTH, min(0.9 + 0.13 * share.shape[1], 6.0))
+def reliability(fraction: np.ndarray, fps: float | None) -> Figure:
+    """Plot the fraction of each body's samples that were measured and follow it, (T, B), over time."""
+    figure = figure_of(WIDTH, min(0.9 + 0.13 * fraction.shape[1], 6.0))
     ax = figure.subplots()
-    end = len(share) / fps if fps else len(share)
+    end = len(fraction) / fps if fps else len(fraction)
     image = ax.imshow(
-        share.T, aspect="auto", vmin=0, vmax=1, cmap="viridis", extent=(0, end, share.shape[1] - 0.5, -0.5)
+        fraction.T, aspect="auto", vmin=0, vmax=1, cmap="viridis", extent=(0, end, fraction.shape[1] - 0.5, -0.5)
     )
     ax.grid(visible=False)
     ax.set_xlabel("time (s)" if fps else "frame")
     ax.set_ylabel("body")
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_title("share of a body's samples that are measured and follow it")
+    ax.set_title("fraction of a body's samples that are measured and follow it")
     figure.colorbar(image, ax=ax, pad=0.01)
     return figure
 
 
-def alternatives_sheet(results: Results, stage: Stage) -> np.ndarray | None:
+def alternatives_sheet(results: Results, stage: ViewStage) -> np.ndarray | None:
     """Return the samples in the colours of their bodies: as found, and as other criteria would part them.
 
     None where the run didn't follow samples.
@@ -75,11 +75,11 @@ def alternatives_sheet(results: Results, stage: Stage) -> np.ndarray | None:
     radius = 0.7 * spacing(points)
     tiles: list[list[np.ndarray | None]] = []
     for view in ("three-quarter", "narrow side"):
-        sight = stage.view(*VIEWS[view], tile_size(stage, *VIEWS[view]))
+        ray = stage.view(*VIEWS[view], tile_size(stage, *VIEWS[view]))
         row: list[np.ndarray | None] = []
         for _, label in columns:
             drawn = replace(gems(points, body_colors(label), radius), outlined=True)
-            row.append(picture(results, stage, Model([drawn]), sight, frame))
+            row.append(picture(results, stage, Model([drawn]), ray, frame))
         tiles.append(row)
     return sheet(tiles, (), [name for name, _ in columns])
 

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from geomocap.cameras import Rig
+from geomocap.model.rig import Rig
 
 Color = Sequence[float]
 """RGB 0–255."""

@@ -7,13 +7,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from geomocap.scheduling import map_items, threads
-from viz import palette, scene
+from viz import body_colors as palette
+from viz import scene
 from viz.drawing import faded, fit, outlined, resize, sheet, write_on
 from viz.floor import floor
-from viz.render import Look, Model, render
+from viz.rendering import Look, Model, render
 from viz.results import Results
 from viz.shapes import Mesh, frustum
-from viz.views import PinholeView, Stage, camera_view
+from viz.viewpoints import PinholeView, ViewStage, camera_view
 
 VIEWS = {"three-quarter": (35.0, 15.0), "broad side": (0.0, 5.0), "narrow side": (90.0, 5.0), "top": (0.0, 80.0)}
 """Free views: azimuth and elevation, degrees. Broad and narrow refer to the subject, whatever it is."""
@@ -28,7 +29,7 @@ def chosen_frames(frames: Sequence[int], count: int) -> list[int]:
     return [frames[round(p)] for p in np.linspace(0, len(frames) - 1, count)]
 
 
-def tile_size(stage: Stage, azimuth_deg: float, elevation_deg: float, area: float = 85_000) -> tuple[int, int]:
+def tile_size(stage: ViewStage, azimuth_deg: float, elevation_deg: float, area: float = 85_000) -> tuple[int, int]:
     """Return the width and height of a picture that suits what a view sees, about `area` pixels large."""
     view = stage.view(azimuth_deg, elevation_deg, (1000, 1000))
     pixels, _ = view.project(stage.points + stage.centers[0])
@@ -38,7 +39,7 @@ def tile_size(stage: Stage, azimuth_deg: float, elevation_deg: float, area: floa
 
 
 def picture(
-    results: Results, stage: Stage, model: Model, view: PinholeView, frame: int, look: Look | None = None
+    results: Results, stage: ViewStage, model: Model, view: PinholeView, frame: int, look: Look | None = None
 ) -> np.ndarray:
     """Return a free view of a model on the floor, (H, W, 3) uint8."""
     place = results.place(frame)
@@ -77,14 +78,14 @@ def path_meshes(results: Results, frame: int) -> list[Mesh]:
 
 
 def geometry_sheet(
-    results: Results, stage: Stage, frames: Sequence[int], build: Builder, views: Sequence[str] = tuple(VIEWS)
+    results: Results, stage: ViewStage, frames: Sequence[int], build: Builder, views: Sequence[str] = tuple(VIEWS)
 ) -> np.ndarray:
     """Return a sheet of one kind of geometry: frames as columns, free views as rows."""
     sights = [stage.view(*VIEWS[v], tile_size(stage, *VIEWS[v])) for v in views]
 
     def column(frame: int) -> list[np.ndarray]:
         model = Model(build(results, frame))
-        return [picture(results, stage, model, sight, frame) for sight in sights]
+        return [picture(results, stage, model, ray, frame) for ray in sights]
 
     with threads() as executor:
         columns = list(map_items(column, list(frames), executor))
@@ -92,22 +93,22 @@ def geometry_sheet(
     return sheet([list(row) for row in zip(*columns, strict=True)], views, labels)
 
 
-def path_sheet(results: Results, stage: Stage, frame: int) -> np.ndarray:
+def path_sheet(results: Results, stage: ViewStage, frame: int) -> np.ndarray:
     """Return the paths of the whole sequence, views beside each other, with the volume of one frame as glass."""
     model = Model(path_meshes(results, frame))
     sights = [stage.view(*angles, tile_size(stage, *angles, 130_000)) for angles in VIEWS.values()]
-    return sheet([[picture(results, stage, model, sight, frame) for sight in sights]], (), tuple(VIEWS))
+    return sheet([[picture(results, stage, model, ray, frame) for ray in sights]], (), tuple(VIEWS))
 
 
 def story_sheet(
-    results: Results, stage: Stage, frames: Sequence[int], rows: Sequence[tuple[str, Builder]]
+    results: Results, stage: ViewStage, frames: Sequence[int], rows: Sequence[tuple[str, Builder]]
 ) -> np.ndarray:
     """Return the way from the geometry to the skeleton: stages as rows, frames as columns, one view."""
     azimuth, elevation = VIEWS["three-quarter"]
-    sight = stage.view(azimuth, elevation, tile_size(stage, azimuth, elevation))
+    ray = stage.view(azimuth, elevation, tile_size(stage, azimuth, elevation))
 
     def column(frame: int) -> list[np.ndarray]:
-        return [picture(results, stage, Model(build(results, frame)), sight, frame) for _, build in rows]
+        return [picture(results, stage, Model(build(results, frame)), ray, frame) for _, build in rows]
 
     with threads() as executor:
         columns = list(map_items(column, list(frames), executor))
@@ -191,7 +192,7 @@ def overlay_sheet(
 
 
 def cameras_picture(
-    results: Results, stage: Stage, frame: int, size: tuple[int, int] = (900, 560)
+    results: Results, stage: ViewStage, frame: int, size: tuple[int, int] = (900, 560)
 ) -> np.ndarray | None:
     """Return the cameras around the subject with their names; None without a calibrated capture."""
     capture = results.capture
@@ -204,7 +205,7 @@ def cameras_picture(
     wires = [frustum(rig, c, depth, thin, palette.ACCENT) for c in range(len(rig))]
     subject = stage.points + target
     everything = np.concatenate([subject, *(w.vertices for w in wires)])
-    wide = Stage(everything - target, target[None], stage.up, stage.broad, stage.floor)
+    wide = ViewStage(everything - target, target[None], stage.up, stage.broad, stage.floor)
     view = wide.view(25.0, 32.0, size, 30.0)
     body = scene.body_skin(results, frame)
     image = render([body, *wires], view, None, stage.up).over(floor(wide, view, [body]))

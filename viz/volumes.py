@@ -38,7 +38,7 @@ def smooth_normals(points: np.ndarray, neighbours: int = 30) -> np.ndarray:
 
 
 def cubes(indices: np.ndarray, origin: np.ndarray, size: float, colors: np.ndarray) -> Mesh:
-    """Return voxels as cubes, without the sides that two of them share.
+    """Return voxels as cubes, without the sides that two of them fraction.
 
     The shading normals lean towards the surface that the voxels together make, so that its shape shows as well.
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.calibration_files.plausibility import check_rig, in_metres
-from geomocap.cameras import Rig
 from geomocap.errors import RunError
+from geomocap.model.rig import Rig
 
 
 def read_colmap(folder: Path, metres_per_unit: float = 1.0) -> Rig:

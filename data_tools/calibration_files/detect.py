@@ -13,8 +13,8 @@ from data_tools.calibration_files.opencv_cameras import read_text
 from data_tools.calibration_files.opencv_yaml import MATRIX_KEYS, read_easymocap, read_opencv
 from data_tools.calibration_files.pose2sim import read_pose2sim
 from data_tools.calibration_files.qualisys import read_qualisys
-from geomocap.cameras import Rig
 from geomocap.errors import CalibrationError
+from geomocap.model.rig import Rig
 
 Kind = Literal["colmap", "easymocap", "opencv", "qualisys", "pose2sim", "aniposelib"]
 

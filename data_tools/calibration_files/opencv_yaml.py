@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from data_tools.calibration_files.opencv_cameras import camera_from_opencv, camera_to_opencv, read_text
 from data_tools.calibration_files.plausibility import check_rig, check_size, in_metres, rotation_matrix
-from geomocap.cameras import Rig
 from geomocap.errors import CalibrationError
-from geomocap.files import write_text
+from geomocap.files.atomic import write_text
+from geomocap.model.rig import Rig
 
 MATRIX_KEYS = ("camera_matrix", "cameraMatrix", "K", "intrinsic_matrix", "M")
 DISTORTION_KEYS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "dist", "D")

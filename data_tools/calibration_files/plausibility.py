@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pycolmap
 
-from geomocap.cameras import Rig
 from geomocap.errors import CalibrationError
+from geomocap.model.rig import Rig
 
 FARTHEST = 60.0
 """Cameras farther apart are hardly metres."""
@@ -100,8 +100,8 @@ def check_rig(rig: Rig, where: str) -> None:
     inverse = np.concatenate([Rt, -np.einsum("cij,cj->ci", Rt, t)[:, :, None]], axis=2)
     together = looking_together(rig.cam_from_world, rig)[0]
     # Upright cameras around a place look all the same way when their poses are inverted
-    share, angle = looking_together(inverse, rig)
-    parallel = _widest_angle(R) < 0.7 and _widest_angle(Rt) > 1.0 and share > 0.99 and angle < 0.35
+    fraction, angle = looking_together(inverse, rig)
+    parallel = _widest_angle(R) < 0.7 and _widest_angle(Rt) > 1.0 and fraction > 0.99 and angle < 0.35
     if together > 0.5 and not parallel:
         return
     others = {
@@ -113,7 +113,7 @@ def check_rig(rig: Rig, where: str) -> None:
         "its translations have the wrong sign (a mirrored world)": np.concatenate([R, -t[:, :, None]], axis=2),
     }
     fits = {what: looking_together(poses, rig) for what, poses in others.items()}
-    good = sorted((angle, what) for what, (share, angle) in fits.items() if share > 0.99)
+    good = sorted((angle, what) for what, (fraction, angle) in fits.items() if fraction > 0.99)
     if good:
         what = good[0][1]
         raise CalibrationError(f"{where}: the cameras look at no common place as it stands, but would if {what}")
@@ -124,7 +124,7 @@ def looking_together(poses: np.ndarray, rig: Rig) -> tuple[float, float]:
 
     Returns
     -------
-    share : float
+    fraction : float
         Of the cameras that have it in their image.
     angle : float
         Mean angle between it and their optical axes, radians.

@@ -10,9 +10,9 @@ import tomli_w
 from scipy.spatial.transform import Rotation
 
 from data_tools.calibration_files.opencv_cameras import camera_from_opencv, camera_to_opencv, read_text
-from geomocap.cameras import Rig
 from geomocap.errors import CalibrationError
-from geomocap.files import write_text
+from geomocap.files.atomic import write_text
+from geomocap.model.rig import Rig
 
 
 def read_pose2sim(path: Path) -> Rig:

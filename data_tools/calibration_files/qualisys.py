@@ -9,8 +9,8 @@ import numpy as np
 import pycolmap
 
 from data_tools.calibration_files.opencv_cameras import HALF_PIXEL, read_text
-from geomocap.cameras import Rig
 from geomocap.errors import CalibrationError
+from geomocap.model.rig import Rig
 
 SUBPIXELS = 64.0
 

@@ -10,7 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomocap.calibration.adjustment import Adjusted, Groups, datum_directions, normal_equations, reduced_system
+from geomocap.calibration.bundle_adjustment import (
+    AdjustedNetwork,
+    Groups,
+    datum_directions,
+    normal_equations,
+    reduced_system,
+)
 from geomocap.errors import CalibrationError
 
 
@@ -37,7 +43,7 @@ class Covariance:
         return float(np.sqrt(np.einsum("peii->", self.points) / (3 * self.points.shape[0] * 2)))
 
 
-def covariance(adjusted: Adjusted) -> Covariance:
+def covariance(adjusted: AdjustedNetwork) -> Covariance:
     """Invert the normal equations of a converged adjustment.
 
     The points' part follows from the cameras' by back-substitution, C_pp = V⁻¹ + V⁻¹ Wᵀ C_cc W V⁻¹, and the change of

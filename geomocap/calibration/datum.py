@@ -15,8 +15,8 @@ import numpy as np
 from geomocap.calibration.network import Network
 from geomocap.calibration.orientation import ideal_coordinates, triangulate
 from geomocap.calibration.projection import interior_of
-from geomocap.cameras import Rig
 from geomocap.errors import CalibrationError
+from geomocap.model.rig import Rig
 
 AXES = {"x": 0, "y": 1, "z": 2}
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from geomocap.calibration.network import Network
 from geomocap.calibration.projection import camera_of
-from geomocap.calibration.sightings import Sightings
+from geomocap.calibration.target_observations import TargetObservations
 
 
 def ball_radius(network: Network, radii: np.ndarray) -> float:
@@ -75,8 +75,8 @@ def _in_camera(network: Network) -> np.ndarray:
     return np.einsum("mij,mj->mi", network.rotation[network.view], X) + network.translation[network.view]
 
 
-def observed_radii(network: Network, sightings: Sightings, chosen: np.ndarray) -> np.ndarray:
-    """Radii (M,) of the observed targets of a network whose views are the sightings' cameras."""
-    t = np.searchsorted(sightings.frames, network.frames)[network.bar]
+def observed_radii(network: Network, observations: TargetObservations, chosen: np.ndarray) -> np.ndarray:
+    """Radii (M,) of the observed targets of a network whose views are the observations' cameras."""
+    t = np.searchsorted(observations.frames, network.frames)[network.bar]
     c = network.view_camera[network.view]
-    return sightings.radii[c, t, chosen[c, t, network.end]]
+    return observations.radii[c, t, chosen[c, t, network.end]]

@@ -6,24 +6,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geomocap.calibration.adjustment import Adjusted, Prior, adjust
+from geomocap.calibration.bundle_adjustment import AdjustedNetwork, Prior, adjust
+from geomocap.calibration.calibration_settings import BarSettings
 from geomocap.calibration.eccentricity import ball_radius, observed_radii, shifts
 from geomocap.calibration.initial import network_of
 from geomocap.calibration.labelling import identify, observed
 from geomocap.calibration.network import Network
-from geomocap.calibration.settings import BarSettings
-from geomocap.calibration.sightings import Sightings
 from geomocap.calibration.stability import refined_changes, resect, split_view, sudden_loss, sudden_shift, test_split
+from geomocap.calibration.target_observations import TargetObservations
 from geomocap.errors import CalibrationError
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Final adjustment and what was made of the sightings.
+    """Final adjustment and what was made of the observations.
 
     Attributes
     ----------
-    adjusted : Adjusted
+    adjusted : AdjustedNetwork
     chosen : (C, T, 2) int
         Candidate that is each end in each image, -1 where none was found.
     rejected : (C, T, 2) bool
@@ -36,7 +36,7 @@ class Estimate:
         By how much the targets' a-priori standard deviations had to be enlarged.
     """
 
-    adjusted: Adjusted
+    adjusted: AdjustedNetwork
     chosen: np.ndarray
     rejected: np.ndarray
     view_of: np.ndarray
@@ -55,8 +55,8 @@ def scale_of(network: Network, residuals: np.ndarray) -> float:
 
 
 def estimate(
-    sightings: Sightings,
-    begin: Adjusted,
+    observations: TargetObservations,
+    begin: AdjustedNetwork,
     length: float,
     settings: BarSettings,
     prior: Prior,
@@ -81,42 +81,42 @@ def estimate(
     """
     length_sigma = length_sigma or settings.length_sigma
     rough = adjust(begin.network, free, prior, loss=2.0, max_iterations=40, tolerance=1e-5)
-    side = sightings.sizes.max(axis=1).astype(float)
-    C, T = sightings.pixels.shape[:2]
+    side = observations.sizes.max(axis=1).astype(float)
+    C, T = observations.pixels.shape[:2]
     view_of = np.tile(np.arange(C)[:, None], (1, T))
-    for share in (0.015, 0.006, 0.004):
+    for fraction in (0.015, 0.006, 0.004):
         spread = 1.4826 * float(np.median(np.abs(rough.residuals)))
-        limit = np.minimum(np.maximum(8 * spread, 1.0), share * side)
-        chosen = identify(sightings, rough.network.interior, poses_of(rough.network), length, limit, view_of=view_of)
-        found = _found_again(sightings, chosen, rough.network, view_of, 0.015 * side, settings.seed)
+        limit = np.minimum(np.maximum(8 * spread, 1.0), fraction * side)
+        chosen = identify(observations, rough.network.interior, poses_of(rough.network), length, limit, view_of=view_of)
+        found = _found_again(observations, chosen, rough.network, view_of, 0.015 * side, settings.seed)
         if found is not None:
             rough = replace(rough, network=found)
-            chosen = identify(sightings, found.interior, poses_of(found), length, limit, view_of=view_of)
-        rough = _relabelled(sightings, chosen, rough, spread, free, prior, view_of)
-        change = sudden_loss(sightings, chosen, view_of)
+            chosen = identify(observations, found.interior, poses_of(found), length, limit, view_of=view_of)
+        rough = _relabelled(observations, chosen, rough, spread, free, prior, view_of)
+        change = sudden_loss(observations, chosen, view_of)
         if change is not None:
-            moved = _with_new_pose(sightings, chosen, rough, change, view_of, float(limit[change[0]]), settings.seed)
+            moved = _with_new_pose(observations, chosen, rough, change, view_of, float(limit[change[0]]), settings.seed)
             if moved is not None:
                 view_of, network = moved
                 rough = replace(rough, network=network)
-                chosen = identify(sightings, network.interior, poses_of(network), length, limit, view_of=view_of)
-                rough = _relabelled(sightings, chosen, rough, spread, free, prior, view_of)
-        change = sudden_shift(rough, view_of, sightings.frames)
+                chosen = identify(observations, network.interior, poses_of(network), length, limit, view_of=view_of)
+                rough = _relabelled(observations, chosen, rough, spread, free, prior, view_of)
+        change = sudden_shift(rough, view_of, observations.frames)
         if change is not None:
-            split = test_split(rough, view_of, sightings.frames, change, prior, loss=2.0)
+            split = test_split(rough, view_of, observations.frames, change, prior, loss=2.0)
             if split is not None:
                 rough, view_of = split
-    view_of = refined_changes(rough.network, sightings, view_of, limit)
-    chosen = identify(sightings, rough.network.interior, poses_of(rough.network), length, limit, view_of=view_of)
-    network = _network(sightings, chosen, rough.network, 0.0, length_sigma, view_of)
+    view_of = refined_changes(rough.network, observations, view_of, limit)
+    chosen = identify(observations, rough.network.interior, poses_of(rough.network), length, limit, view_of=view_of)
+    network = _network(observations, chosen, rough.network, 0.0, length_sigma, view_of)
     final, factor = clean(network, free, prior, settings)
     radius = 0.0
-    radii = observed_radii(final.network, sightings, chosen)
+    radii = observed_radii(final.network, observations, chosen)
     if settings.targets.shape == "sphere" and np.all(radii > 0):
         radius = target_radius or ball_radius(final.network, radii)
         # Once more with the images of the balls' centres instead of the centres of their images
         n = network.with_state(final.network.interior, final.network.rotation, final.network.translation, network.bars)
-        n = _network(sightings, chosen, n, 0.0, length_sigma, view_of)
+        n = _network(observations, chosen, n, 0.0, length_sigma, view_of)
         n = replace(n, pixels=n.pixels - shifts(n, radius))
         final, factor = clean(n, free, prior, settings)
     kept = np.zeros(chosen.shape, dtype=bool)
@@ -128,40 +128,40 @@ def estimate(
                 f"camera {n.names[c]}: only {bars} bar positions fit the other cameras; check its synchronization, and "
                 "record more positions where it and two others see the bar"
             )
-    kept[n.view_camera[n.view], _times(n, sightings), n.end] = True
+    kept[n.view_camera[n.view], _times(n, observations), n.end] = True
     return Estimate(final, chosen, (chosen >= 0) & ~kept, view_of, radius, factor)
 
 
 def _network(
-    sightings: Sightings,
+    observations: TargetObservations,
     chosen: np.ndarray,
     state: Network,
     least_sigma: float,
     length_sigma: float,
     view_of: np.ndarray,
 ) -> Network:
-    pixels, sigmas = observed(sightings, chosen)
+    pixels, sigmas = observed(observations, chosen)
     sigmas = np.maximum(sigmas, least_sigma)
     poses = poses_of(state)
-    return network_of(sightings, pixels, sigmas, state.interior, poses, state.length, length_sigma, view_of)
+    return network_of(observations, pixels, sigmas, state.interior, poses, state.length, length_sigma, view_of)
 
 
 def _relabelled(
-    sightings: Sightings,
+    observations: TargetObservations,
     chosen: np.ndarray,
-    rough: Adjusted,
+    rough: AdjustedNetwork,
     spread: float,
     free: tuple[int, ...],
     prior: Prior,
     view_of: np.ndarray,
-) -> Adjusted:
+) -> AdjustedNetwork:
     length_sigma = max(0.002 * rough.network.length, 1e-6)
-    network = _network(sightings, chosen, rough.network, 0.5 * spread, length_sigma, view_of)
+    network = _network(observations, chosen, rough.network, 0.5 * spread, length_sigma, view_of)
     return adjust(network, free, prior, loss=2.0, max_iterations=40, tolerance=1e-5)
 
 
 def _found_again(
-    sightings: Sightings,
+    observations: TargetObservations,
     chosen: np.ndarray,
     network: Network,
     view_of: np.ndarray,
@@ -173,7 +173,7 @@ def _found_again(
     A camera that was chained wrongly can't mend itself; its interior orientation starts again from the others' as well.
     """
     fits = (chosen >= 0).any(axis=2)
-    checkable = (sightings.counts >= 2) & (fits.sum(axis=0) - fits >= 2)
+    checkable = (observations.counts >= 2) & (fits.sum(axis=0) - fits >= 2)
     rate = (checkable & fits).sum(axis=1) / np.maximum(checkable.sum(axis=1), 1)
     lost = [c for c in range(len(rate)) if rate[c] < 0.75 and view_of[c].min() == view_of[c].max()]
     side = network.sizes.max(axis=1)
@@ -189,7 +189,7 @@ def _found_again(
         trial[c, 2:4] = network.sizes[c] / 2
         rng = np.random.default_rng((seed, c))
         known = replace(network, interior=trial)
-        pose = resect(known, sightings, c, np.flatnonzero(checkable[c]), float(limit[c]), rng, 0.35)
+        pose = resect(known, observations, c, np.flatnonzero(checkable[c]), float(limit[c]), rng, 0.35)
         if pose is not None:
             interior[c], rotation[c], translation[c] = trial[c], pose[:, :3], pose[:, 3]
             changed = True
@@ -197,9 +197,9 @@ def _found_again(
 
 
 def _with_new_pose(
-    sightings: Sightings,
+    observations: TargetObservations,
     chosen: np.ndarray,
-    rough: Adjusted,
+    rough: AdjustedNetwork,
     change: tuple[int, int],
     view_of: np.ndarray,
     limit: float,
@@ -209,10 +209,10 @@ def _with_new_pose(
     camera, start = change
     before = (chosen[camera, :start] >= 0).any(axis=1).mean()
     after = (chosen[camera, start:] >= 0).any(axis=1).mean()
-    T = len(sightings.frames)
+    T = len(observations.frames)
     lost = np.arange(start, T) if before > after else np.arange(start)
     rng = np.random.default_rng((seed, camera, start))
-    pose = resect(rough.network, sightings, camera, lost, max(limit, 2.0), rng)
+    pose = resect(rough.network, observations, camera, lost, max(limit, 2.0), rng)
     if pose is None:
         return None
     n = rough.network
@@ -224,7 +224,9 @@ def _with_new_pose(
     return split, replace(n, view_camera=np.r_[n.view_camera, camera], rotation=rotation, translation=translation)
 
 
-def clean(network: Network, free: tuple[int, ...], prior: Prior, settings: BarSettings) -> tuple[Adjusted, float]:
+def clean(
+    network: Network, free: tuple[int, ...], prior: Prior, settings: BarSettings
+) -> tuple[AdjustedNetwork, float]:
     """Adjust robustly, then by least squares without outliers until their set stays.
 
     Where the residuals are well beyond what the targets' precision lets expect (cameras not quite synchronized, say),
@@ -233,7 +235,7 @@ def clean(network: Network, free: tuple[int, ...], prior: Prior, settings: BarSe
 
     Returns
     -------
-    adjusted : Adjusted
+    adjusted : AdjustedNetwork
     factor : float
         By how much the standard deviations of image points were enlarged.
     """
@@ -263,16 +265,16 @@ def clean(network: Network, free: tuple[int, ...], prior: Prior, settings: BarSe
     return result, factor
 
 
-def _outliers(adjusted: Adjusted, threshold: float) -> np.ndarray:
+def _outliers(adjusted: AdjustedNetwork, threshold: float) -> np.ndarray:
     """Observations (M,) bool beyond so many standard deviations, and all of bars whose length is."""
     network = adjusted.network
-    # Residuals are smaller than errors by the share of the observations that checks the others
-    share = np.sqrt((2 * len(network.bar) + len(network.bars)) / max(adjusted.redundancy, 1))
-    scale = max(scale_of(network, adjusted.residuals), 0.5) * max(0.9 * share, 1.0)
+    # Residuals are smaller than errors by the fraction of the observations that checks the others
+    fraction = np.sqrt((2 * len(network.bar) + len(network.bars)) / max(adjusted.redundancy, 1))
+    scale = max(scale_of(network, adjusted.residuals), 0.5) * max(0.9 * fraction, 1.0)
     bad = np.linalg.norm(adjusted.residuals / network.sigmas[:, None], axis=1) > threshold * scale
     lengths = np.linalg.norm(network.bars[:, 0] - network.bars[:, 1], axis=1) - network.length
     return bad | (np.abs(lengths) > threshold * scale * network.length_sigma)[network.bar]
 
 
-def _times(network: Network, sightings: Sightings) -> np.ndarray:
-    return np.searchsorted(sightings.frames, network.frames)[network.bar]
+def _times(network: Network, observations: TargetObservations) -> np.ndarray:
+    return np.searchsorted(observations.frames, network.frames)[network.bar]

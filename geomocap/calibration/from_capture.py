@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, ValidationError
 
-from geomocap.calibration.calibrate import Calibration, calibrate_bar
-from geomocap.calibration.observations import Observed
+from geomocap.calibration.bar_calibration import Calibration, calibrate_bar
+from geomocap.calibration.calibration_settings import BarSettings
+from geomocap.calibration.observed_points import Observed
 from geomocap.calibration.recording import Recording, measure
-from geomocap.calibration.settings import BarSettings
 from geomocap.calibration.targets import find_targets, gray_of
-from geomocap.calibration.world import World
-from geomocap.cameras import Rig
-from geomocap.capture import check_links, read_capture_info
+from geomocap.calibration.world import WorldKnowledge
 from geomocap.errors import CalibrationError, CaptureError
-from geomocap.image_files import IMAGE_ENDINGS, read_image
+from geomocap.files.capture import check_links, read_capture_info
+from geomocap.files.images import IMAGE_ENDINGS, read_image
+from geomocap.model.rig import Rig
 from geomocap.progress import Progress, silent
 from geomocap.settings import Settings
 
@@ -39,7 +39,7 @@ def up_of(folder: Path) -> str:
 def calibrate_capture(
     folder: Path,
     settings: BarSettings | None = None,
-    world: World | None = None,
+    world: WorldKnowledge | None = None,
     given: Rig | None = None,
     length: float | None = None,
     progress: Progress = silent,
@@ -52,7 +52,7 @@ def calibrate_capture(
     folder : Path
         A capture, with bar/<camera>/000000.png or bar/<camera>.mp4, and bar/bar.toml.
     settings : BarSettings, optional
-    world : World, optional
+    world : WorldKnowledge, optional
         What fixes the world; if it names nothing, the frames of `floor` in `bar.toml` do, or an L-shaped reference in
         the folder `reference`, if there are.
     given : Rig, optional
@@ -74,15 +74,15 @@ def calibrate_capture(
     settings = settings or BarSettings()
     cameras = read_capture_info(folder).cameras if (folder / "capture.toml").exists() else None
     recording = Recording.open(folder / "bar", cameras, length)
-    sightings = measure(recording, settings.targets, progress, executor)
-    world = replace(world or World(), up=up_of(folder))
-    if world == World(up=world.up):
+    observations = measure(recording, settings.targets, progress, executor)
+    world = replace(world or WorldKnowledge(), up=up_of(folder))
+    if world == WorldKnowledge(up=world.up):
         if recording.info.floor:
             world = replace(world, floor=recording.info.floor)
         elif (folder / "reference").is_dir():
             world = with_l_shape(world, folder / "reference", recording.cameras, settings)
     return calibrate_bar(
-        sightings,
+        observations,
         recording.info.length,
         settings,
         world,
@@ -93,7 +93,9 @@ def calibrate_capture(
     )
 
 
-def with_l_shape(world: World, folder: Path, cameras: tuple[str, ...], settings: BarSettings) -> World:
+def with_l_shape(
+    world: WorldKnowledge, folder: Path, cameras: tuple[str, ...], settings: BarSettings
+) -> WorldKnowledge:
     """Measure an L-shaped reference: folder/<camera>/<any>.png or folder/<camera>.png, and folder/reference.toml.
 
     Raises
@@ -133,8 +135,8 @@ def with_l_shape(world: World, folder: Path, cameras: tuple[str, ...], settings:
 
 
 def with_points(
-    world: World, observed: Observed, coordinates: dict[str, np.ndarray], cameras: tuple[str, ...]
-) -> World:
+    world: WorldKnowledge, observed: Observed, coordinates: dict[str, np.ndarray], cameras: tuple[str, ...]
+) -> WorldKnowledge:
     """Fix the world by observed points of known coordinates.
 
     Parameters

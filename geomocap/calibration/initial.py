@@ -9,22 +9,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from geomocap.calibration.adjustment import Adjusted, adjust, image_residuals, interior_indices
+from geomocap.calibration.bundle_adjustment import AdjustedNetwork, adjust, image_residuals, interior_indices
+from geomocap.calibration.calibration_settings import BarSettings
 from geomocap.calibration.lens_model import weak_prior
 from geomocap.calibration.network import Network
 from geomocap.calibration.orientation import chain, ideal_coordinates, relative_orientation, triangulate
 from geomocap.calibration.pairs import Pairing, pair_ends
 from geomocap.calibration.projection import N_INTERIOR
-from geomocap.calibration.settings import BarSettings
-from geomocap.calibration.sightings import Sightings
+from geomocap.calibration.target_observations import TargetObservations
 from geomocap.errors import CalibrationError
 
 
-def two_candidates(sightings: Sightings) -> np.ndarray:
+def two_candidates(observations: TargetObservations) -> np.ndarray:
     """Return the two candidates of the images that have just two, (C, T, 2, 2) float, NaN elsewhere."""
-    two = np.full((*sightings.pixels.shape[:2], 2, 2), np.nan)
-    just = sightings.counts == 2
-    two[just] = sightings.pixels[just][:, :2]
+    two = np.full((*observations.pixels.shape[:2], 2, 2), np.nan)
+    just = observations.counts == 2
+    two[just] = observations.pixels[just][:, :2]
     return two
 
 
@@ -34,9 +34,9 @@ def image_coordinates(pixels: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     return (pixels - sizes.reshape(shape) / 2) / sizes.max(axis=1).reshape(*shape[:-1], 1)
 
 
-def pair_all(sightings: Sightings, settings: BarSettings) -> dict[tuple[int, int], Pairing]:
+def pair_all(observations: TargetObservations, settings: BarSettings) -> dict[tuple[int, int], Pairing]:
     """Pair the bar ends of all pairs of cameras."""
-    x = image_coordinates(two_candidates(sightings), sightings.sizes)
+    x = image_coordinates(two_candidates(observations), observations.sizes)
     found = {}
     for i in range(len(x)):
         for j in range(i + 1, len(x)):
@@ -47,7 +47,9 @@ def pair_all(sightings: Sightings, settings: BarSettings) -> dict[tuple[int, int
     return found
 
 
-def consistent_ends(sightings: Sightings, pairings: dict[tuple[int, int], Pairing]) -> tuple[np.ndarray, np.ndarray]:
+def consistent_ends(
+    observations: TargetObservations, pairings: dict[tuple[int, int], Pairing]
+) -> tuple[np.ndarray, np.ndarray]:
     """Tell the ends apart over all cameras that the pairings connect, frame by frame.
 
     Returns
@@ -57,7 +59,7 @@ def consistent_ends(sightings: Sightings, pairings: dict[tuple[int, int], Pairin
     swapped : (C, T) bool
         Whether its first candidate is the bar's second end.
     """
-    C, T = sightings.counts.shape
+    C, T = observations.counts.shape
     group = np.tile(np.arange(C)[:, None], (1, T))
     swapped = np.zeros((C, T), dtype=bool)
     for (i, j), p in sorted(pairings.items(), key=lambda item: -len(item[1].frames)):
@@ -77,7 +79,7 @@ def consistent_ends(sightings: Sightings, pairings: dict[tuple[int, int], Pairin
 
 
 def network_of(
-    sightings: Sightings,
+    observations: TargetObservations,
     pixels: np.ndarray,
     sigmas: np.ndarray,
     interior: np.ndarray,
@@ -103,7 +105,7 @@ def network_of(
         view_of = np.tile(np.arange(len(pixels))[:, None], (1, pixels.shape[1]))
     rays_per_end = np.isfinite(pixels[..., 0]).sum(axis=0)
     pixels = np.where((rays_per_end >= 2).all(axis=1)[None, :, None, None], pixels, np.nan)
-    ideal = ideal_coordinates(pixels, interior, sightings.sizes)
+    ideal = ideal_coordinates(pixels, interior, observations.sizes)
     seen = np.isfinite(ideal).all(axis=-1)
     bar, camera, end = np.nonzero(np.moveaxis(seen, 0, 1))
     view = view_of[camera, bar]
@@ -114,19 +116,19 @@ def network_of(
     directions = np.einsum("mji,mj->mi", R[view], rays)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     origins = -np.einsum("cji,cj->ci", R, t)
-    T = len(sightings.frames)
+    T = len(observations.frames)
     points = triangulate(origins[view], directions, 2 * bar + end, 2 * T)
     view_camera = np.zeros(len(poses), dtype=np.int64)
     view_camera[view_of] = np.arange(len(pixels))[:, None]
     network = Network(
-        sightings.cameras,
-        sightings.sizes,
+        observations.cameras,
+        observations.sizes,
         interior,
         view_camera,
         np.array(R),
         np.array(t),
         points.reshape(T, 2, 3),
-        sightings.frames,
+        observations.frames,
         bar,
         view,
         end,
@@ -150,16 +152,16 @@ FIRST = interior_indices(("fx", "fy", "k1"))
 
 
 def start(
-    sightings: Sightings,
+    observations: TargetObservations,
     length: float,
     settings: BarSettings,
     given: np.ndarray | None = None,
-) -> Adjusted:
+) -> AdjustedNetwork:
     """Find approximate values of everything.
 
     Parameters
     ----------
-    sightings : Sightings
+    observations : TargetObservations
     length : float
         Of the bar, metres.
     settings : BarSettings
@@ -171,19 +173,19 @@ def start(
     CalibrationError
         If the cameras can't be connected or nothing consistent is found.
     """
-    pairings = pair_all(sightings, settings)
+    pairings = pair_all(observations, settings)
     if not pairings:
         raise CalibrationError(
             "no two cameras see both ends of the bar in at least eight common frames that fit together; "
             "record more positions, all over the volume, and check that the frames are synchronized"
         )
-    member, swapped = consistent_ends(sightings, pairings)
-    two = two_candidates(sightings)
+    member, swapped = consistent_ends(observations, pairings)
+    two = two_candidates(observations)
     ends = np.where(swapped[..., None, None], two[:, :, ::-1], two)
     ends = np.where(member[..., None, None], ends, np.nan)
-    side = sightings.sizes.max(axis=1).astype(float)
+    side = observations.sizes.max(axis=1).astype(float)
     sigmas = np.broadcast_to(settings.start_sigma * side[:, None, None], ends.shape[:3])
-    best: Adjusted | None = None
+    best: AdjustedNetwork | None = None
     best_score = np.inf
     failure: CalibrationError | None = None
     for factor in settings.focal_candidates if given is None else (1.0,):
@@ -191,14 +193,14 @@ def start(
         if given is None:
             interior = np.zeros((len(side), N_INTERIOR))
             interior[:, 0] = interior[:, 1] = focal
-            interior[:, 2:4] = sightings.sizes / 2
+            interior[:, 2:4] = observations.sizes / 2
             free = FIRST
         else:
             interior, free = given, ()
         try:
-            poses = _oriented(sightings, two, pairings, interior, length)
-            network = network_of(sightings, ends, sigmas, interior, poses, length, 0.02 * length)
-            prior = weak_prior(sightings.sizes, interior[:, 0], settings)
+            poses = _oriented(observations, two, pairings, interior, length)
+            network = network_of(observations, ends, sigmas, interior, poses, length, 0.02 * length)
+            prior = weak_prior(observations.sizes, interior[:, 0], settings)
             result = adjust(network, free, prior, loss=2.0, max_iterations=25, tolerance=1e-3)
         except CalibrationError as error:
             failure = failure or error
@@ -213,13 +215,13 @@ def start(
 
 
 def _oriented(
-    sightings: Sightings,
+    observations: TargetObservations,
     two: np.ndarray,
     pairings: dict[tuple[int, int], Pairing],
     interior: np.ndarray,
     length: float,
 ) -> np.ndarray:
-    ideal = ideal_coordinates(two, interior, sightings.sizes)
+    ideal = ideal_coordinates(two, interior, observations.sizes)
     relatives = {}
     for (i, j), p in pairings.items():
         a = ideal[i, p.frames]
@@ -228,12 +230,12 @@ def _oriented(
         if good.sum() < 6:
             continue
         # From the pairing's image coordinates to ideal ones
-        side_i, side_j = sightings.sizes[i].max(), sightings.sizes[j].max()
+        side_i, side_j = observations.sizes[i].max(), observations.sizes[j].max()
         scale_i = np.diag([interior[i, 0] / side_i, interior[i, 1] / side_i, 1.0])
         scale_j = np.diag([interior[j, 0] / side_j, interior[j, 1] / side_j, 1.0])
-        scale_i[:2, 2] = (interior[i, 2:4] - sightings.sizes[i] / 2) / side_i
-        scale_j[:2, 2] = (interior[j, 2:4] - sightings.sizes[j] / 2) / side_j
+        scale_i[:2, 2] = (interior[i, 2:4] - observations.sizes[i] / 2) / side_i
+        scale_j[:2, 2] = (interior[j, 2:4] - observations.sizes[j] / 2) / side_j
         relative = relative_orientation(a[good], b[good], scale_j.T @ p.F @ scale_i, length)
         if relative is not None:
             relatives[i, j] = relative
-    return chain(relatives, sightings.cameras)
+    return chain(relatives, observations.cameras)

@@ -12,7 +12,7 @@ from numba import njit
 
 from geomocap.calibration.orientation import ideal_coordinates
 from geomocap.calibration.projection import project_point
-from geomocap.calibration.sightings import Sightings
+from geomocap.calibration.target_observations import TargetObservations
 
 
 @njit(cache=True, nogil=True)
@@ -125,7 +125,7 @@ def identify_frame(pixels, ideal, interior, R, t, length, length_tolerance, thre
 
 
 def identify(
-    sightings: Sightings,
+    observations: TargetObservations,
     interior: np.ndarray,
     poses: np.ndarray,
     length: float,
@@ -137,7 +137,7 @@ def identify(
 
     Parameters
     ----------
-    sightings : Sightings
+    observations : TargetObservations
     interior : (C, 13) float
     poses : (V, 3, 4) float
         Of the views.
@@ -155,15 +155,15 @@ def identify(
     chosen : (C, T, 2) int
         Candidate that is each end in each image, -1 where there is none.
     """
-    ideal = ideal_coordinates(sightings.pixels, interior, sightings.sizes)
-    C, T = sightings.pixels.shape[:2]
+    ideal = ideal_coordinates(observations.pixels, interior, observations.sizes)
+    C, T = observations.pixels.shape[:2]
     chosen = np.full((C, T, 2), -1, dtype=np.int64)
     if view_of is None:
         view_of = np.tile(np.arange(C)[:, None], (1, T))
     single = np.empty((C, 2), dtype=np.int64)
     for f in range(T):
         identify_frame(
-            np.ascontiguousarray(sightings.pixels[:, f]),
+            np.ascontiguousarray(observations.pixels[:, f]),
             np.ascontiguousarray(ideal[:, f]),
             interior,
             np.ascontiguousarray(poses[view_of[:, f], :, :3]),
@@ -177,10 +177,10 @@ def identify(
     return chosen
 
 
-def observed(sightings: Sightings, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def observed(observations: TargetObservations, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return pixels (C, T, 2, 2) and standard deviations (C, T, 2) of the chosen candidates, NaN where none."""
     index = np.maximum(chosen, 0)
-    pixels = np.take_along_axis(sightings.pixels, index[..., None], axis=2)
-    sigmas = np.take_along_axis(sightings.sigmas, index, axis=2)
+    pixels = np.take_along_axis(observations.pixels, index[..., None], axis=2)
+    sigmas = np.take_along_axis(observations.sigmas, index, axis=2)
     none = chosen < 0
     return np.where(none[..., None], np.nan, pixels), np.where(none, np.nan, sigmas)

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomocap.calibration.adjustment import OPENCV, Adjusted, Prior, adjust, interior_indices
+from geomocap.calibration.bundle_adjustment import OPENCV, AdjustedNetwork, Prior, adjust, interior_indices
+from geomocap.calibration.calibration_settings import BarSettings
 from geomocap.calibration.covariance import covariance
 from geomocap.calibration.projection import INTERIOR_NAMES, N_INTERIOR
-from geomocap.calibration.settings import BarSettings
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,9 @@ def weak_prior(sizes: np.ndarray, focal: np.ndarray, settings: BarSettings) -> P
     return Prior(mean, sigma, settings.aspect_sigma * focal)
 
 
-def choose_model(adjusted: Adjusted, prior: Prior, settings: BarSettings) -> tuple[Adjusted, tuple[Significance, ...]]:
+def choose_model(
+    adjusted: AdjustedNetwork, prior: Prior, settings: BarSettings
+) -> tuple[AdjustedNetwork, tuple[Significance, ...]]:
     """Test the parameters beyond OPENCV, and take k3 into the model if the observations ask for it.
 
     Shear (and k3 where it is not part of the model) is estimated in an extra adjustment and tested against its standard
@@ -73,7 +75,7 @@ def choose_model(adjusted: Adjusted, prior: Prior, settings: BarSettings) -> tup
     return adjusted, tuple(t for t in tests if t.parameter not in in_model)
 
 
-def tests_of(adjusted: Adjusted, parameters: tuple[int, ...]) -> tuple[Significance, ...]:
+def tests_of(adjusted: AdjustedNetwork, parameters: tuple[int, ...]) -> tuple[Significance, ...]:
     """Return value and standard deviation of these interior parameters of every camera."""
     C = covariance(adjusted).cameras
     columns = adjusted.columns
@@ -88,7 +90,7 @@ def tests_of(adjusted: Adjusted, parameters: tuple[int, ...]) -> tuple[Significa
 
 
 def prior_for(
-    sizes: np.ndarray, begin: Adjusted, given: np.ndarray | None, settings: BarSettings
+    sizes: np.ndarray, begin: AdjustedNetwork, given: np.ndarray | None, settings: BarSettings
 ) -> tuple[Prior, tuple[int, ...]]:
     """Prior and free parameters of the final model."""
     if given is not None:

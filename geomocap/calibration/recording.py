@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, ValidationError
 
-from geomocap.calibration.settings import TargetSettings
-from geomocap.calibration.sightings import Sightings, stack_candidates
+from geomocap.calibration.calibration_settings import TargetSettings
+from geomocap.calibration.target_observations import TargetObservations, stack_candidates
 from geomocap.calibration.targets import find_targets, gray_of, still_background
-from geomocap.capture import FrameSource
 from geomocap.errors import CaptureError
-from geomocap.image_files import IMAGE_ENDINGS, ImageFolder
+from geomocap.files.capture import FrameSource
+from geomocap.files.images import IMAGE_ENDINGS, ImageFolder
+from geomocap.files.videos import VIDEO_ENDINGS, Video
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads
 from geomocap.settings import Settings
-from geomocap.video_files import VIDEO_ENDINGS, Video
 
 
 class BarInfo(Settings):
@@ -123,7 +123,7 @@ def measure(
     settings: TargetSettings,
     progress: Progress = silent,
     executor: Executor | None = None,
-) -> Sightings:
+) -> TargetObservations:
     """Find and measure the targets in all images.
 
     Candidates that are much fainter than the camera's targets usually are get dropped.

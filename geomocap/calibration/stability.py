@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geomocap.calibration.adjustment import Adjusted, Prior, adjust
+from geomocap.calibration.bundle_adjustment import AdjustedNetwork, Prior, adjust
 from geomocap.calibration.initial import in_front
 from geomocap.calibration.network import Network
 from geomocap.calibration.orientation import ideal_coordinates
 from geomocap.calibration.projection import project_point
-from geomocap.calibration.sightings import Sightings
+from geomocap.calibration.target_observations import TargetObservations
 
 LEAST = 6
 """Frames on either side of a knock that are needed to tell it."""
@@ -61,7 +61,7 @@ def moved_of(network: Network, view_of: np.ndarray, frames: np.ndarray) -> tuple
     return tuple(out)
 
 
-def sudden_loss(sightings: Sightings, chosen: np.ndarray, view_of: np.ndarray) -> tuple[int, int] | None:
+def sudden_loss(observations: TargetObservations, chosen: np.ndarray, view_of: np.ndarray) -> tuple[int, int] | None:
     """Find the camera whose targets stop, or begin, to fit the others' at some frame.
 
     Parameters
@@ -81,7 +81,7 @@ def sudden_loss(sightings: Sightings, chosen: np.ndarray, view_of: np.ndarray) -
     for c in range(len(found)):
         if len(np.unique(view_of[c])) > 1:
             continue
-        usable = np.flatnonzero((sightings.counts[c] >= 2) & (elsewhere - found[c] >= 2))
+        usable = np.flatnonzero((observations.counts[c] >= 2) & (elsewhere - found[c] >= 2))
         fits = found[c, usable].astype(float)
         n = len(usable)
         for k in range(LEAST, n - LEAST + 1):
@@ -92,7 +92,7 @@ def sudden_loss(sightings: Sightings, chosen: np.ndarray, view_of: np.ndarray) -
     return None if best is None else (best[1], best[2])
 
 
-def sudden_shift(adjusted: Adjusted, view_of: np.ndarray, frames: np.ndarray) -> tuple[int, int] | None:
+def sudden_shift(adjusted: AdjustedNetwork, view_of: np.ndarray, frames: np.ndarray) -> tuple[int, int] | None:
     """Find the camera whose residuals call most for another pose from some frame on.
 
     A step of the pose is fitted to the residuals of each camera from each frame on; the step that explains most of them
@@ -136,7 +136,9 @@ def sudden_shift(adjusted: Adjusted, view_of: np.ndarray, frames: np.ndarray) ->
     return best[1], best[2]
 
 
-def refined_changes(network: Network, sightings: Sightings, view_of: np.ndarray, limit: np.ndarray) -> np.ndarray:
+def refined_changes(
+    network: Network, observations: TargetObservations, view_of: np.ndarray, limit: np.ndarray
+) -> np.ndarray:
     """Move each change of a camera's pose to the frame that explains its targets best.
 
     Parameters
@@ -150,16 +152,16 @@ def refined_changes(network: Network, sightings: Sightings, view_of: np.ndarray,
     view_of : (C, T) int
     """
     out = view_of.copy()
-    time = np.searchsorted(sightings.frames, network.frames)
+    time = np.searchsorted(observations.frames, network.frames)
     J = np.empty((2, 22))
     xy = np.empty(2)
     for c in range(len(view_of)):
         views = [int(view_of[c, 0]), int(view_of[c, -1])]
         if views[0] == views[1]:
             continue
-        cost = np.zeros((2, len(sightings.frames)))
+        cost = np.zeros((2, len(observations.frames)))
         for p, t in enumerate(time):
-            targets = sightings.pixels[c, t]
+            targets = observations.pixels[c, t]
             if np.isfinite(targets[:, 0]).sum() < 2:
                 continue
             for k, v in enumerate(views):
@@ -174,7 +176,7 @@ def refined_changes(network: Network, sightings: Sightings, view_of: np.ndarray,
         old = int(np.flatnonzero(np.diff(view_of[c]))[0]) + 1
         best = int(np.flatnonzero(total <= total.min() * (1 + 1e-9))[0])
         start = best if total[best] < total[old] else old
-        if LEAST <= start <= len(sightings.frames) - LEAST:
+        if LEAST <= start <= len(observations.frames) - LEAST:
             out[c] = np.where(np.arange(len(out[c])) < start, views[0], views[1])
     return out
 
@@ -206,8 +208,13 @@ def with_views(network: Network, view_of: np.ndarray, frames: np.ndarray, camera
 
 
 def test_split(
-    adjusted: Adjusted, view_of: np.ndarray, frames: np.ndarray, change: tuple[int, int], prior: Prior, loss: float
-) -> tuple[Adjusted, np.ndarray] | None:
+    adjusted: AdjustedNetwork,
+    view_of: np.ndarray,
+    frames: np.ndarray,
+    change: tuple[int, int],
+    prior: Prior,
+    loss: float,
+) -> tuple[AdjustedNetwork, np.ndarray] | None:
     """Adjust with a camera in two positions; None if that explains no more than chance."""
     camera, start = change
     split = split_view(view_of, camera, start, adjusted.network.n_views)
@@ -221,12 +228,12 @@ def test_split(
 
 def resect(
     network: Network,
-    sightings: Sightings,
+    observations: TargetObservations,
     camera: int,
     frames: np.ndarray,
     limit: float,
     rng: np.random.Generator,
-    least_share: float = 0.4,
+    least_fraction: float = 0.4,
 ) -> np.ndarray | None:
     """Find the pose of a camera from bars that the others know, the ends not told apart.
 
@@ -239,22 +246,22 @@ def resect(
         Indices of the frames to use.
     limit : float
         Largest error of a fitting target, pixels.
-    least_share : float
-        Share of the frames that must fit.
+    least_fraction : float
+        Fraction of the frames that must fit.
 
     Returns
     -------
     pose : (3, 4) float or None
     """
     known = {int(f): p for p, f in enumerate(network.frames)}
-    usable = [t for t in frames if sightings.counts[camera, t] == 2 and int(sightings.frames[t]) in known]
+    usable = [t for t in frames if observations.counts[camera, t] == 2 and int(observations.frames[t]) in known]
     if len(usable) < LEAST:
         return None
-    bars = network.bars[[known[int(sightings.frames[t])] for t in usable]]
-    pixels = sightings.pixels[camera, usable, :2]
-    all_cameras = np.full((len(sightings.cameras), len(usable), 2, 2), np.nan)
+    bars = network.bars[[known[int(observations.frames[t])] for t in usable]]
+    pixels = observations.pixels[camera, usable, :2]
+    all_cameras = np.full((len(observations.cameras), len(usable), 2, 2), np.nan)
     all_cameras[camera] = pixels
-    ideal = ideal_coordinates(all_cameras, network.interior, sightings.sizes)[camera]
+    ideal = ideal_coordinates(all_cameras, network.interior, observations.sizes)[camera]
     threshold = limit / network.interior[camera, 0]
 
     def errors(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -285,7 +292,7 @@ def resect(
                 best = (count, pose)
         if best is not None and best[0] > 0.9 * len(usable):
             break
-    if best is None or best[0] < max(LEAST, least_share * len(usable)):
+    if best is None or best[0] < max(LEAST, least_fraction * len(usable)):
         return None
     pose = best[1]
     for _ in range(3):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from geomocap.calibration.calibration_settings import TargetSettings
 from geomocap.calibration.disc import fit_disc
-from geomocap.calibration.settings import TargetSettings
-from geomocap.capture import FrameSource
+from geomocap.files.capture import FrameSource
 
 SATURATION = 254.0
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomocap.calibration.adjustment import Adjusted
+from geomocap.calibration.bundle_adjustment import AdjustedNetwork
+from geomocap.calibration.calibration_quality import CameraMotion, CameraPrecision, HeldOut, ImageCoverage
 from geomocap.calibration.datum import Datum
-from geomocap.calibration.quality import CameraPrecision, Coverage, HeldOut, Motion
 from geomocap.calibration.stability import Moved
 
 
@@ -31,11 +31,11 @@ class Verdict:
 
 
 def judge(
-    adjusted: Adjusted,
+    adjusted: AdjustedNetwork,
     precision: tuple[CameraPrecision, ...],
-    covered: tuple[Coverage, ...],
+    covered: tuple[ImageCoverage, ...],
     moved: tuple[Moved, ...],
-    how: Motion,
+    how: CameraMotion,
     lengths: HeldOut,
     datum: Datum,
     lost: np.ndarray,
@@ -47,9 +47,9 @@ def judge(
     Parameters
     ----------
     lost : (C,) float
-        Share of each camera's frames in which it has targets, but none that fits the bar found by the others.
+        Fraction of each camera's frames in which it has targets, but none that fits the bar found by the others.
     rejected : (C,) float
-        Share of each camera's fitting targets that were left out as outliers.
+        Fraction of each camera's fitting targets that were left out as outliers.
     sigma0 : float
         For the targets' a-priori standard deviations.
     """
@@ -73,10 +73,10 @@ def judge(
             grave.append(
                 f"camera {p.camera}: only {p.rays} bar ends observed; record at least 15 positions in its view"
             )
-        elif c.share < 0.5:
+        elif c.fraction < 0.5:
             where = f", nothing in the {c.empty_side}" if c.empty_side else ""
             doubtful.append(
-                f"camera {p.camera}: the bar was seen in {100 * c.share:.0f} % of its image only{where}; "
+                f"camera {p.camera}: the bar was seen in {100 * c.fraction:.0f} % of its image only{where}; "
                 "move it there too, the distortion is extrapolated"
             )
     for k, name in enumerate(n.names):
@@ -108,10 +108,10 @@ def judge(
     summary = (
         f"{grade.capitalize()} calibration of {len(n.names)} cameras by {len(n.bars)} bar positions: "
         f"held-out bars are right to {1000 * lengths.rms:.2f} mm RMS, "
-        f"1/{_inverse(relative)} of the volume of {lengths.extent:.1f} m."
+        f"1/{_inverse(relative)} of the volume of {lengths.diagonal:.1f} m."
     )
     return Verdict(grade, summary, tuple(grave + doubtful))
 
 
-def _inverse(share: float) -> str:
-    return f"{1 / share:.0f}" if share > 0 else "∞"
+def _inverse(fraction: float) -> str:
+    return f"{1 / fraction:.0f}" if fraction > 0 else "∞"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomocap.calibration.adjustment import Adjusted
+from geomocap.calibration.bundle_adjustment import AdjustedNetwork
 from geomocap.calibration.datum import (
     Datum,
     datum_from_cameras,
@@ -16,11 +16,11 @@ from geomocap.calibration.datum import (
     datum_from_points,
     datum_from_rig,
 )
-from geomocap.cameras import Rig
+from geomocap.model.rig import Rig
 
 
 @dataclass(frozen=True)
-class World:
+class WorldKnowledge:
     """What is known of the world's frame; the first of these that is given counts.
 
     Attributes
@@ -49,7 +49,7 @@ class World:
     gravity: tuple[str, tuple[float, float, float]] | None = None
     up: str = "z"
 
-    def datum(self, adjusted: Adjusted, target_radius: float) -> Datum:
+    def datum(self, adjusted: AdjustedNetwork, target_radius: float) -> Datum:
         """Find the world of an adjusted network."""
         network = adjusted.network
         if self.rig is not None:

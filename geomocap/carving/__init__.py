@@ -1,12 +1,12 @@
 """Space carving: silhouettes to coloured surface voxels."""
 
 from geomocap.carving.agreement import check_agreement, check_cameras, check_inside, check_silhouettes
+from geomocap.carving.carving_settings import CarvingSettings, ConsistencySettings, HullSettings
 from geomocap.carving.frames import carve_frame, needs_images
-from geomocap.carving.grid import Grid
 from geomocap.carving.hull import hull, hull_surface, visual_hull
-from geomocap.carving.settings import CarvingSettings, ConsistencySettings, HullSettings
-from geomocap.carving.views import PinholeViews, Undistortion, undistort_masks
+from geomocap.carving.silhouette_views import PinholeViews, Undistortion, undistort_masks
 from geomocap.carving.volume import working_volume
+from geomocap.carving.voxel_grid import Grid
 
 __all__ = [
     "CarvingSettings",

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from geomocap.carving.bounds import CELLS, focus, subject_cells
-from geomocap.carving.grid import Grid
+from geomocap.carving.carving_settings import HullSettings
 from geomocap.carving.hull import hull
-from geomocap.carving.settings import HullSettings
-from geomocap.carving.views import PinholeViews
+from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.carving.subject_bounds import CELLS, focus, subject_cells
+from geomocap.carving.voxel_grid import Grid
 from geomocap.errors import CalibrationError, GeometryError
 
 LOW_COVERAGE = 0.5  # silhouettes of which half the cameras explain less than this are suspicious
@@ -33,12 +33,12 @@ def check_cameras(views: PinholeViews, settings: HullSettings) -> None:
         return
     if settings.outside != "empty":
         least = settings.views_of(len(views))
-        if not _share_view(views, HullSettings(outside="unseen", min_views=least)):
+        if not _fraction_view(views, HullSettings(outside="unseen", min_views=least)):
             raise CalibrationError(f"no point is seen by {least} of {', '.join(views.names)}; check their poses")
         return
-    if _share_view(views):
+    if _fraction_view(views):
         return
-    away = [name for c, name in enumerate(views.names) if len(views) > 2 and _share_view(views.without(c))]
+    away = [name for c, name in enumerate(views.names) if len(views) > 2 and _fraction_view(views.without(c))]
     if len(away) == 1:
         raise CalibrationError(
             f"camera {away[0]} looks away: it sees nothing of what the other cameras all see; check its pose, or leave "
@@ -85,7 +85,7 @@ def check_silhouettes(
         remedy = f"set carving.hull.outside = 'auto', name only the other cameras in capture.toml, or {remedy}"
     raise GeometryError(
         f"frame {frame}: the silhouette of camera {', '.join(empty)} is empty, or nearly so; check {cause}; where the "
-        f"subject is out of sight, {remedy}"
+        f"subject is out of ray, {remedy}"
     )
 
 
@@ -97,12 +97,12 @@ def check_agreement(views: PinholeViews, frame: int, settings: HullSettings) -> 
     GeometryError
         If not, naming the camera that contradicts the others: the one without which they agree best.
     """
-    share = silhouette_coverage(views, settings)
-    reached = float(np.median(share))
+    fraction = silhouette_coverage(views, settings)
+    reached = float(np.median(fraction))
     if reached >= LOW_COVERAGE:
-        if not share.all():
+        if not fraction.all():
             raise GeometryError(
-                f"frame {frame}: camera {views.names[int(share.argmin())]} looks away: the volume that the others see "
+                f"frame {frame}: camera {views.names[int(fraction.argmin())]} looks away: what the others see "
                 "is nowhere in its silhouette; check its calibration, synchronization and silhouettes, or leave it out"
             )
         return
@@ -116,7 +116,7 @@ def check_agreement(views: PinholeViews, frame: int, settings: HullSettings) -> 
             f"(the common volume explains {reached:.0%} of the silhouettes with it, {without[worst]:.0%} without it); "
             "check its calibration, synchronization and silhouettes, or leave it out"
         )
-    if not share.any():
+    if not fraction.any():
         raise GeometryError(
             f"frame {frame}: the silhouettes of {', '.join(views.names)} have no common volume; check calibration, "
             "synchronization and silhouettes"
@@ -124,7 +124,7 @@ def check_agreement(views: PinholeViews, frame: int, settings: HullSettings) -> 
 
 
 def silhouette_coverage(views: PinholeViews, settings: HullSettings) -> np.ndarray:
-    """Share of each silhouette that the hull explains, (C,) float from 0 to 1; 1 for an empty silhouette.
+    """Fraction of each silhouette that the hull explains, (C,) float from 0 to 1; 1 for an empty silhouette.
 
     The hull is the coarse one of `subject_cells`, so that thin parts count as explained.
 
@@ -136,7 +136,7 @@ def silhouette_coverage(views: PinholeViews, settings: HullSettings) -> np.ndarr
     cells, origin, edge = subject_cells(views, settings)
     centers, half = origin + (cells + 0.5) * edge, edge / 2
     C, H, W = views.masks.shape
-    share, blind = np.ones(C), views.blind()
+    fraction, blind = np.ones(C), views.blind()
     for c, (P, mask) in enumerate(zip(views.projections, views.masks, strict=True)):
         n = centers @ P[:, :3].T + P[:, 3]
         near = n[:, 2] - half * np.abs(P[2, :3]).sum()
@@ -153,8 +153,8 @@ def silhouette_coverage(views: PinholeViews, settings: HullSettings) -> np.ndarr
         np.add.at(corners, (high[:, 1], low[:, 0]), -1)
         covered = corners.cumsum(axis=0).cumsum(axis=1)[:H, :W] > 0
         if not blind[c]:
-            share[c] = covered[mask != 0].mean()
-    return share
+            fraction[c] = covered[mask != 0].mean()
+    return fraction
 
 
 def check_inside(surface: np.ndarray, grid: Grid, frame: int, max_cut: float = 0.0) -> None:
@@ -168,7 +168,7 @@ def check_inside(surface: np.ndarray, grid: Grid, frame: int, max_cut: float = 0
     frame : int
         For messages.
     max_cut : float
-        Share of the surface voxels that may lie on the grid's border.
+        Fraction of the surface voxels that may lie on the grid's border.
 
     Raises
     ------
@@ -188,15 +188,15 @@ def check_inside(surface: np.ndarray, grid: Grid, frame: int, max_cut: float = 0
             cut |= on_border
             if on_border.any():
                 sides.append(f"{side} {name}")
-    share = float(cut.mean())
-    if share > max_cut:
+    fraction = float(cut.mean())
+    if fraction > max_cut:
         raise GeometryError(
             f"frame {frame}: subject outside the volume from {_show(grid.low)} to {_show(grid.high)}: it is cut off at "
-            f"{', '.join(sides)} ({share:.1%} of its surface); enlarge carving.volume, or allow it with carving.max_cut"
+            f"{', '.join(sides)} ({fraction:.1%} of its surface); enlarge carving.volume or allow it by carving.max_cut"
         )
 
 
-def _share_view(views: PinholeViews, settings: HullSettings = ALL) -> bool:
+def _fraction_view(views: PinholeViews, settings: HullSettings = ALL) -> bool:
     """Whether some point is seen by enough cameras, looking on several scales round where their axes meet."""
     everything = views.everything()
     center, reach = focus(everything)

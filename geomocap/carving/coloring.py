@@ -6,10 +6,10 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-from geomocap.carving.grid import Grid
 from geomocap.carving.occupancy import Occupancy
-from geomocap.carving.views import PinholeViews
-from geomocap.carving.visibility import SurfaceVoxels, depth_buffers, normals, sightings
+from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.carving.visibility import SurfaceVoxels, depth_buffers, normals, observations
+from geomocap.carving.voxel_grid import Grid
 
 GREY = 160
 
@@ -22,7 +22,7 @@ def voxel_colors(views: PinholeViews, images: np.ndarray, grid: Grid, occupancy:
     """
     voxels = SurfaceVoxels.of(occupancy)
     surface = voxels.indices
-    seen = sightings(views, images, grid, voxels, depth_buffers(views, grid, voxels))
+    seen = observations(views, images, grid, voxels, depth_buffers(views, grid, voxels))
     centers = -np.linalg.solve(views.projections[:, :, :3], views.projections[:, :, 3:])[:, :, 0]
     colors = np.full((len(surface), 3), GREY, np.uint8)
     has_color = np.zeros(len(surface), np.bool_)

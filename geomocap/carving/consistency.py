@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from geomocap.carving.grid import Grid
+from geomocap.carving.carving_settings import ConsistencySettings
 from geomocap.carving.occupancy import Occupancy
-from geomocap.carving.settings import ConsistencySettings
-from geomocap.carving.views import PinholeViews
-from geomocap.carving.visibility import Sightings, SurfaceVoxels, depth_buffers, sightings
+from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.carving.visibility import SurfaceVoxels, VoxelVisibility, depth_buffers, observations
+from geomocap.carving.voxel_grid import Grid
 
 
 def carve_inconsistent(
@@ -48,7 +48,7 @@ def carve_inconsistent(
         surface = SurfaceVoxels.of(Occupancy(bits, occupancy.shape))
         depth = depth_buffers(views, grid, surface, depth)
         voxels = surface if step == 0 else surface.select(_near(changed, surface.indices))
-        seen = sightings(views, images, grid, voxels, depth, settings.window)
+        seen = observations(views, images, grid, voxels, depth, settings.window)
         if step == 0 and settings.gain:
             gains = camera_gains(seen)
         deviation = color_deviation(seen, gains, settings.min_cameras)
@@ -59,7 +59,7 @@ def carve_inconsistent(
     return Occupancy(bits, occupancy.shape)
 
 
-def camera_gains(seen: Sightings, samples: int = 2000) -> np.ndarray:
+def camera_gains(seen: VoxelVisibility, samples: int = 2000) -> np.ndarray:
     """Estimate one factor a camera and channel that brings its colours to the middle of all, (C, 3) float32.
 
     The median over voxels that three or more cameras see of (median colour of the cameras / this camera's colour).
@@ -81,7 +81,7 @@ def camera_gains(seen: Sightings, samples: int = 2000) -> np.ndarray:
     return gains
 
 
-def color_deviation(seen: Sightings, gains: np.ndarray, min_cameras: int) -> np.ndarray:
+def color_deviation(seen: VoxelVisibility, gains: np.ndarray, min_cameras: int) -> np.ndarray:
     """Standard deviation of a voxel's colours about their median, (N,) float32, grey values; -1 where too few see it.
 
     A camera whose window holds the median colour counts as deviating by nothing.

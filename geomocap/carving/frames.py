@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from geomocap.carving.agreement import check_agreement, check_inside, check_silhouettes
+from geomocap.carving.carving_settings import CarvingSettings
 from geomocap.carving.coloring import GREY, voxel_colors
 from geomocap.carving.consistency import carve_inconsistent
-from geomocap.carving.grid import Grid
 from geomocap.carving.hull import hull
-from geomocap.carving.settings import CarvingSettings
-from geomocap.carving.views import PinholeViews
-from geomocap.geometry import Voxels
+from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.carving.voxel_grid import Grid
+from geomocap.model.frame_geometry import Voxels
 
 _DEFAULT = CarvingSettings()
 

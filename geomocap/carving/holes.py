@@ -6,18 +6,18 @@ import cv2
 import numpy as np
 from numba import njit
 
-from geomocap.cameras import Rig
-from geomocap.carving.bounds import subject_box
-from geomocap.carving.grid import Grid
+from geomocap.carving.carving_settings import HullSettings
 from geomocap.carving.hull import heard, hull
-from geomocap.carving.settings import HullSettings
-from geomocap.carving.views import PinholeViews
+from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.carving.subject_bounds import subject_box
+from geomocap.carving.voxel_grid import Grid
 from geomocap.errors import GeometryError
+from geomocap.model.rig import Rig
 
 RESOLUTION = 96  # of the others' hull; a hole that matters is many such voxels wide
 SAMPLES = 200  # rays through a hole, and through its rim
 LEAST_OTHERS = 3  # two cameras' hull is too bulky to say where the subject is thick
-SHARE = 0.75  # a false hole's rays cross at least this share of what its rim's rays cross
+FRACTION = 0.75  # a false hole's rays cross at least this fraction of what its rim's rays cross
 ALL_BUT_ONE = HullSettings(tolerance=1, min_views=LEAST_OTHERS + 1)
 EMPTY, NOBODY = -2, -1  # voxel outside the hull; voxel on which all cameras agree (else: the camera that doesn't)
 MOST_HOLES = 40  # largest first; more of them are noise that the evidence has to settle
@@ -65,7 +65,7 @@ def fill_false_holes(rig: Rig, views: PinholeViews, masks: list[np.ndarray]) -> 
         for inside, rim in holes[c]:
             within = _thickness(rig, c, inside, dissent, grid)
             beside = _thickness(rig, c, rim, dissent, grid)
-            if np.quantile(within, 0.1) > 0 and np.median(within) >= SHARE * np.median(beside):
+            if np.quantile(within, 0.1) > 0 and np.median(within) >= FRACTION * np.median(beside):
                 filled[inside[:, 1], inside[:, 0]] = 255
         result[c] = filled
     return result

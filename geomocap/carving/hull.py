@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 
 from geomocap.carving.block_kernels import carve, summed
-from geomocap.carving.grid import Grid
+from geomocap.carving.carving_settings import HullSettings
 from geomocap.carving.occupancy import Occupancy
-from geomocap.carving.settings import HullSettings
-from geomocap.carving.views import PinholeViews
+from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.carving.voxel_grid import Grid
 
 _DEFAULT = HullSettings()
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from geomocap.carving.grid import Grid
+from geomocap.carving.carving_settings import HullSettings
 from geomocap.carving.hull import heard
-from geomocap.carving.settings import HullSettings
-from geomocap.carving.views import PinholeViews
+from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.carving.voxel_grid import Grid
 
 _DEFAULT = HullSettings()
 

@@ -11,15 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from geomocap.carving.grid import Grid
 from geomocap.carving.occupancy import Occupancy
-from geomocap.carving.views import PinholeViews
+from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.carving.voxel_grid import Grid
 
 DEPTH_SLACK = 1.5  # voxels that something must lie before a centre to hide it: a slanted surface doesn't hide itself
 
 
 @dataclass(frozen=True)
-class Sightings:
+class VoxelVisibility:
     """What the cameras see of surface voxels.
 
     Attributes
@@ -81,9 +81,9 @@ def depth_buffers(views: PinholeViews, grid: Grid, surface: SurfaceVoxels, out: 
     return depth
 
 
-def sightings(
+def observations(
     views: PinholeViews, images: np.ndarray, grid: Grid, voxels: SurfaceVoxels, depth: np.ndarray, window: int = 0
-) -> Sightings:
+) -> VoxelVisibility:
     """Find which cameras see each of some surface voxels and with which colour.
 
     Parameters
@@ -120,7 +120,7 @@ def sightings(
         low,
         high,
     )
-    return Sightings(seen, colors, low, high)
+    return VoxelVisibility(seen, colors, low, high)
 
 
 def normals(occupancy: Occupancy, surface: np.ndarray) -> np.ndarray:

@@ -8,10 +8,10 @@ from itertools import count
 import numpy as np
 
 from geomocap.carving.agreement import check_agreement, check_silhouettes
-from geomocap.carving.bounds import subject_box
-from geomocap.carving.grid import Grid
-from geomocap.carving.settings import CarvingSettings
-from geomocap.carving.views import PinholeViews
+from geomocap.carving.carving_settings import CarvingSettings
+from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.carving.subject_bounds import subject_box
+from geomocap.carving.voxel_grid import Grid
 from geomocap.errors import GeometryError
 
 MOST_VOXELS = 1 << 30  # one bit each: 128 MB; a longer way than this is carved more coarsely

@@ -9,20 +9,20 @@ import typer
 
 import geomocap
 from geomocap import pipeline
-from geomocap.cli import captures
-from geomocap.cli.calibrate import calibrate
-from geomocap.cli.evaluate import evaluate
+from geomocap.cli import capture_commands as captures
+from geomocap.cli.calibrate_command import calibrate
+from geomocap.cli.evaluate_command import evaluate
 from geomocap.cli.execution import Scheduler, Workers
-from geomocap.cli.export import export
+from geomocap.cli.export_command import export
 from geomocap.cli.info import info
 from geomocap.cli.jobs import CaptureFolder, ExistingRun, RunFolder, capture_job, scans_job
-from geomocap.cli.keypoints import keypoints
-from geomocap.cli.progress import progress_bars
+from geomocap.cli.keypoint_command import keypoints
+from geomocap.cli.progress_bars import progress_bars
 from geomocap.cli.reports import capture_of, console, review_job, tell_clouds, tell_results
 from geomocap.cli.settings_options import with_file_of_options, with_settings
 from geomocap.config import Config
-from geomocap.run import Run
-from viz.files import render_file
+from geomocap.files.run import Run
+from viz.picture_files import render_file
 from viz.review import review as review_files
 
 app = typer.Typer(
@@ -52,7 +52,7 @@ def options(
 
 
 Fps = Annotated[float, typer.Option("--fps", min=0.001, help="Scans per second.")]
-BODIES = ("segmentation", "skeleton", "nodes", "motion_bodies", "motion_skeleton", "refinement", "take")
+BODIES = ("segmentation", "skeleton", "nodes", "motion_bodies", "motion_skeleton", "refinement", "following")
 ModelFile = Annotated[
     Path | None,
     typer.Option(
@@ -141,8 +141,8 @@ def run(
 
     A run that was stopped goes on where it was; stages whose inputs and settings have not changed are not done again.
 
-    With a model of the subject, saved as model.npz by a run of another take, bodies and joints are not looked for: the
-    model is found in this take and followed through it.
+    With a model of the subject, saved as model.npz by a run of another sequence, bodies and joints are not looked for:
+    the model is found in this sequence and followed through it.
 
     Example: `geomocap run CAPTURE RUN --carving.resolution 192`
     """

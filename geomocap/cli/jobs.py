@@ -9,15 +9,15 @@ from typing import Annotated
 
 import typer
 
-from geomocap.articulation.model import MODEL_FILE, read_model
-from geomocap.capture import Capture
 from geomocap.cli.execution import executor_for
-from geomocap.cli.progress import progress_bars
+from geomocap.cli.progress_bars import progress_bars
 from geomocap.config import Config
 from geomocap.errors import RunError
+from geomocap.files.capture import Capture
+from geomocap.files.run import Run
+from geomocap.files.scans import open_scans
 from geomocap.pipeline.job import Job
-from geomocap.run import Run
-from geomocap.scans import open_scans
+from geomocap.subject.subject_model import MODEL_FILE, read_model
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder, with capture.toml.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder; made if it isn't there.")]
@@ -60,7 +60,7 @@ def _check_model(model: Path | None, run: Path) -> None:
         return
     read_model(model)
     if model.resolve() == (run / MODEL_FILE).resolve():
-        raise RunError(f"{model}: is the model of this very run; choose another folder for the take")
+        raise RunError(f"{model}: is the model of this very run; choose another folder for the sequence")
 
 
 def _check_apart(source: Path, run: Path) -> None:

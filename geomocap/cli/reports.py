@@ -6,12 +6,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from geomocap.capture import Capture
 from geomocap.errors import GeomocapError
-from geomocap.files import fingerprint
-from geomocap.pipeline.clouds import read_cloud_record
+from geomocap.files.atomic import fingerprint
+from geomocap.files.capture import Capture
+from geomocap.files.run import Run, stage_key
+from geomocap.pipeline.cloud_stage import read_cloud_record
 from geomocap.pipeline.job import Job
-from geomocap.run import Run, stage_key
 from viz.review import review
 
 console = Console(highlight=False, soft_wrap=True)

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment, minimize_scalar
 
+from geomocap.evaluation.evaluation_settings import EvaluationSettings
 from geomocap.evaluation.marker_track import MarkerTrack
 from geomocap.evaluation.result import Alignment, EvaluationError
-from geomocap.evaluation.settings import EvaluationSettings
 
 Pairs = list[tuple[int, int]]
 
@@ -26,7 +26,7 @@ ROUNDS, FEW_ROUNDS = 30, 8
 FEW_FRAMES = 24
 KEPT_STARTS = 2  # of the 24
 TIE, TIE_M = 0.05, 0.002  # fits that are worse by no more than this are as good as the best
-START_LIMIT, END_LIMIT = 0.5, 0.15  # shares of the extent within which trajectories match, narrowing
+START_LIMIT, END_LIMIT = 0.5, 0.15  # fractions of the diagonal within which trajectories match, narrowing
 FEWEST_FRAMES = 3
 
 
@@ -35,7 +35,7 @@ def align_trajectories(
     times: np.ndarray,
     track: MarkerTrack,
     settings: EvaluationSettings,
-    extent: float,
+    diagonal: float,
     pairs: Pairs | None = None,
 ) -> Alignment:
     """Find the time offset and the rigid motion that lay the truth on the run, as far as the settings ask for them.
@@ -48,7 +48,7 @@ def align_trajectories(
     track : MarkerTrack
         The truth, at any time.
     settings : EvaluationSettings
-    extent : float, metres
+    diagonal : float, metres
         Size of the subject.
     pairs : list of (joint, marker), optional
         Where it is known which marker is which joint.
@@ -64,7 +64,7 @@ def align_trajectories(
     offsets = candidate_offsets(found, times, track, settings.max_offset) if settings.find_offset else [settings.offset]
     fits = []
     for offset in offsets:
-        fit = _fit_at(offset, found, times, track, settings, extent, pairs)
+        fit = _fit_at(offset, found, times, track, settings, diagonal, pairs)
         if fit is not None:
             fits.append(fit)
     if not fits:
@@ -91,7 +91,7 @@ def _fit_at(
     times: np.ndarray,
     track: MarkerTrack,
     settings: EvaluationSettings,
-    extent: float,
+    diagonal: float,
     pairs: Pairs | None,
 ) -> _Fit | None:
     """Find the best alignment near a time offset: from all starts on a few frames, then from the best on all."""
@@ -99,10 +99,10 @@ def _fit_at(
     starts = _starts(found, other) if settings.align else [Alignment(np.eye(3), np.zeros(3), offset)]
     if len(starts) > 1:
         few = np.unique(np.linspace(0, len(found) - 1, FEW_FRAMES).round().astype(int))
-        tried = [_match_and_fit(found[few], other[few], s, extent, True, pairs, rounds=FEW_ROUNDS) for s in starts]
+        tried = [_match_and_fit(found[few], other[few], s, diagonal, True, pairs, rounds=FEW_ROUNDS) for s in starts]
         ranked = sorted((fit for fit in tried if fit is not None), key=lambda fit: fit.cost)
         starts = [fit.alignment for fit in ranked[:KEPT_STARTS]]
-    fits = [_match_and_fit(found, other, s, extent, settings.align, pairs) for s in starts]
+    fits = [_match_and_fit(found, other, s, diagonal, settings.align, pairs) for s in starts]
     fit = min((f for f in fits if f is not None), key=lambda f: f.cost, default=None)
     if fit is None:
         return None
@@ -111,7 +111,7 @@ def _fit_at(
         if settings.find_offset:
             alignment = _refine_offset(found, times, track, alignment, fit.pairs, settings.align)
         other = track.at(times + alignment.time_offset)
-        again = _match_and_fit(found, other, alignment, extent, settings.align, pairs, start_limit=END_LIMIT)
+        again = _match_and_fit(found, other, alignment, diagonal, settings.align, pairs, start_limit=END_LIMIT)
         if again is None:
             break
         fit, alignment = again, again.alignment
@@ -200,7 +200,7 @@ def _match_and_fit(
     found: np.ndarray,
     other: np.ndarray,
     start: Alignment,
-    extent: float,
+    diagonal: float,
     align: bool,
     pairs: Pairs | None,
     *,
@@ -209,7 +209,7 @@ def _match_and_fit(
 ) -> _Fit | None:
     """Match trajectories and fit the rigid motion in turn."""
     R, t = start.rotation, start.translation
-    limits = np.geomspace(start_limit, END_LIMIT, rounds) * extent
+    limits = np.geomspace(start_limit, END_LIMIT, rounds) * diagonal
     seen = np.isfinite(found).all(-1)[:, :, None] & np.isfinite(other).all(-1)[:, None]
     count = seen.sum(axis=0)
     if not (count >= FEWEST_FRAMES).any():
@@ -234,7 +234,7 @@ def _match_and_fit(
         R, t, matched = R_new, t_new, now
     if not matched:
         return None
-    cap = END_LIMIT * extent
+    cap = END_LIMIT * diagonal
     distance = np.where(seen, np.linalg.norm(found[:, :, None] - (other @ R.T + t)[:, None], axis=-1), 0.0)
     mean = distance.sum(axis=0) / np.maximum(count, 1)
     costs = [min(mean[i, j], cap) for i, j in matched]

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from geomocap.evaluation.alignment import align_trajectories
+from geomocap.evaluation.evaluation_settings import EvaluationSettings
 from geomocap.evaluation.marker_track import MarkerTrack
 from geomocap.evaluation.result import Alignment, Curve, Evaluation, EvaluationError, Match
-from geomocap.evaluation.settings import EvaluationSettings
 from geomocap.export.bvh import read_bvh
 from geomocap.export.c3d import read_c3d
 from geomocap.export.conventions import Axis, Convention, Unit
@@ -97,15 +97,15 @@ def compare_markers(
     truth = Convention(other.up, "m").world_points(other.positions, found.up)
     _check_present(found, "the run")
     _check_present(other, "the other system")
-    extent, theirs = _extent(found.positions), _extent(truth)
-    if not 1 / OTHER_UNITS < theirs / extent < OTHER_UNITS:
+    diagonal, theirs = _diagonal(found.positions), _diagonal(truth)
+    if not 1 / OTHER_UNITS < theirs / diagonal < OTHER_UNITS:
         raise EvaluationError(
-            f"the other system's points span {theirs:.4g} m, the run's {extent:.4g} m; one of them is in other units"
+            f"the other system's points span {theirs:.4g} m, the run's {diagonal:.4g} m; one of them is in other units"
         )
     pairs = _named_pairs(found.names, other.names, matches)
     times = np.arange(found.n_frames) / found.fps
     track = MarkerTrack(truth, other.fps)
-    alignment = align_trajectories(found.positions, times, track, settings, extent, pairs)
+    alignment = align_trajectories(found.positions, times, track, settings, diagonal, pairs)
     moved = track.at(times + alignment.time_offset) @ alignment.rotation.T + alignment.translation
     both = np.isfinite(moved).all(-1).any(1) & np.isfinite(found.positions).all(-1).any(1)
     if both.sum() < 2:
@@ -115,14 +115,14 @@ def compare_markers(
         )
     distance = pair_distances(found.positions, moved)
     if pairs is None:
-        pairs = match_by_distance(distance, settings.match_within * extent)
+        pairs = match_by_distance(distance, settings.match_within * diagonal)
     pairs = [(i, j) for i, j in pairs if np.isfinite(distance[:, i, j]).any()]
     if not pairs:
         raise EvaluationError(
-            f"no joint lies within {settings.match_within * extent * 1000:.0f} mm of a marker; the worlds or clocks "
+            f"no joint lies within {settings.match_within * diagonal * 1000:.0f} mm of a marker; the worlds or clocks "
             "differ (--align, --find_offset), or name the pairs in a TOML (--matches)"
         )
-    return _judge(found, other, distance, pairs, alignment, settings, extent)
+    return _judge(found, other, distance, pairs, alignment, settings, diagonal)
 
 
 def pair_distances(found: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -158,7 +158,7 @@ def _check_present(markers: Markers, whose: str) -> None:
         raise EvaluationError(f"{whose} has no position in any frame; there is nothing to compare")
 
 
-def _extent(positions: np.ndarray) -> float:
+def _diagonal(positions: np.ndarray) -> float:
     """Median over time of the largest side of the box around the points, metres."""
     seen = np.isfinite(positions).all(axis=-1)
     frames = seen.sum(axis=1) > 0
@@ -173,7 +173,7 @@ def _judge(
     pairs: list[tuple[int, int]],
     alignment: Alignment,
     settings: EvaluationSettings,
-    extent: float,
+    diagonal: float,
 ) -> Evaluation:
     each = np.stack([distance[:, i, j] for i, j in pairs]) * 1000
     seen = np.isfinite(each)
@@ -186,7 +186,7 @@ def _judge(
         "markers.mean_error": float(all_of_them.mean()),
         "markers.median_error": float(np.median(all_of_them)),
         "markers.p95_error": float(np.percentile(all_of_them, 95)),
-        "markers.mean_error_%extent": float(all_of_them.mean() / 10 / extent),
+        "markers.mean_error_%diagonal": float(all_of_them.mean() / 10 / diagonal),
     }
     if settings.find_offset:
         figures["alignment.time_offset_s"] = alignment.time_offset

@@ -10,7 +10,7 @@ from scipy.optimize import linear_sum_assignment
 from geomocap.evaluation.result import Curve, Evaluation, Match
 from geomocap.evaluation.truth import Truth, angles_deg
 
-FOUND_WITHIN, WELL_WITHIN, CAP = 0.10, 0.05, 0.15  # shares of the height
+FOUND_WITHIN, WELL_WITHIN, CAP = 0.10, 0.05, 0.15  # fractions of the height
 LOST = 10.0  # heights: what a joint without a position counts as
 
 

@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 
 from geomocap.evaluation.result import Curve, Evaluation, EvaluationError
 from geomocap.evaluation.truth import Truth
-from geomocap.geometry import Voxels
-from geomocap.open3d_files import read_by_open3d
-from geomocap.run import Run
+from geomocap.files.open3d_geometry import read_by_open3d
+from geomocap.files.run import Run
+from geomocap.model.frame_geometry import Voxels
 
 NEAR_MM = 10.0
 
@@ -41,7 +41,7 @@ def judge_surface(run: Run, truth: Truth, kind: Literal["voxels", "cloud"], fram
         f"{kind}.accuracy_median": np.median(d),
         f"{kind}.accuracy_p95": np.percentile(d, 95),
         f"{kind}.completeness_median": np.median(c),
-        f"{kind}.share_of_surface_within_10mm": float(np.mean(c < NEAR_MM)),
+        f"{kind}.fraction_of_surface_within_10mm": float(np.mean(c < NEAR_MM)),
     }
     at = np.array(judged)
     curves = (

@@ -12,7 +12,7 @@ import open3d as o3d
 from geomocap.evaluation.result import EvaluationError
 
 ACTIVE_DEG = 15.0  # a rig joint is active when its segment turns at least this much against its parent segment
-MIN_SHARE = 0.012  # a segment with a smaller share of the surface (fingers, eyes) belongs to its parent's body
+MIN_FRACTION = 0.012  # a segment with a smaller fraction of the surface (fingers, eyes) belongs to its parent's body
 HEIGHTS = (0.01, 100.0)  # m; subjects beyond are in other units
 
 SHAPES = {
@@ -177,12 +177,12 @@ def true_bodies(truth: Truth) -> TrueBodies:
     """Group rig joints into rigid bodies by the motion that is really there.
 
     From the root outwards, a joint begins a body of its own when its segment turns at least `ACTIVE_DEG` against the
-    body before it (largest angle since the first frame), and both have more than `MIN_SHARE` of the surface.
+    body before it (largest angle since the first frame), and both have more than `MIN_FRACTION` of the surface.
     """
     parents, n = truth.joint_parents, len(truth.joint_parents)
-    share = _surface_share(truth)
+    fraction = _surface_fraction(truth)
     order = _parents_first(parents)
-    subtree = share.copy()
+    subtree = fraction.copy()
     for j in reversed(order):
         if parents[j] >= 0:
             subtree[parents[j]] += subtree[j]
@@ -194,21 +194,21 @@ def true_bodies(truth: Truth) -> TrueBodies:
         above = of_joint[parents[j]] if parents[j] >= 0 else -1
         if above >= 0 and not (
             _largest_turn_deg(truth.joint_rotations, root[above], j) >= ACTIVE_DEG
-            and subtree[j] >= MIN_SHARE
-            and surface[above] >= MIN_SHARE
+            and subtree[j] >= MIN_FRACTION
+            and surface[above] >= MIN_FRACTION
         ):
             of_joint[j] = above
-            surface[above] += share[j]
+            surface[above] += fraction[j]
             continue
         of_joint[j] = len(root)
         root.append(j)
         parent_body.append(above)
-        surface.append(share[j])
+        surface.append(fraction[j])
     return TrueBodies(of_joint, np.array(root), np.array(parent_body))
 
 
-def _surface_share(truth: Truth) -> np.ndarray:
-    """Share of the surface, in the first frame, that each rig joint moves most."""
+def _surface_fraction(truth: Truth) -> np.ndarray:
+    """Fraction of the surface, in the first frame, that each rig joint moves most."""
     corner = truth.vertices[0][truth.faces]
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
     joint = truth.vertex_joint[truth.faces[:, 0]]

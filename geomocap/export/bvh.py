@@ -16,30 +16,30 @@ from typing import Literal
 import numpy as np
 
 from geomocap.export.conventions import BVH, Axis, Convention
-from geomocap.export.errors import MotionError
-from geomocap.export.motion import Motion
-from geomocap.export.rotations import rotation_about, zxy_angles
-from geomocap.files import write_text
+from geomocap.export.export_errors import MotionError
+from geomocap.export.file_rotations import rotation_about, zxy_angles
+from geomocap.export.motion_tree import MotionTree
+from geomocap.files.atomic import write_text
 
 ROTATION_CHANNELS = ("Zrotation", "Xrotation", "Yrotation")
 POSITION_CHANNELS = ("Xposition", "Yposition", "Zposition")
 DECIMALS = 6
 
 
-def write_bvh(path: Path, motion: Motion, *, unit: Literal["m", "cm"] = "m") -> None:
+def write_bvh(path: Path, motion: MotionTree, *, unit: Literal["m", "cm"] = "m") -> None:
     """Write a motion as BVH, whole or not at all.
 
     Parameters
     ----------
     path : Path
-    motion : Motion
+    motion : MotionTree
     unit : "m" or "cm"
         BVH has no place for its unit: who opens the file has to know it.
     """
     write_text(path, bvh_text(motion.converted(Convention(BVH.up, unit))))
 
 
-def bvh_text(motion: Motion) -> str:
+def bvh_text(motion: MotionTree) -> str:
     """Return the BVH of a motion that already is in the file's axes and unit."""
     lines = ["HIERARCHY"]
     _write_node(motion, 0, 0, lines)
@@ -57,7 +57,7 @@ def bvh_text(motion: Motion) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _depth_first(motion: Motion, node: int) -> list[int]:
+def _depth_first(motion: MotionTree, node: int) -> list[int]:
     order, stack = [], [node]
     while stack:
         n = stack.pop()
@@ -66,7 +66,7 @@ def _depth_first(motion: Motion, node: int) -> list[int]:
     return order
 
 
-def _write_node(motion: Motion, node: int, depth: int, lines: list[str]) -> None:
+def _write_node(motion: MotionTree, node: int, depth: int, lines: list[str]) -> None:
     tabs = "\t" * depth
     positioned = node == 0 or motion.moving[node]
     channels = (*POSITION_CHANNELS, *ROTATION_CHANNELS) if positioned else ROTATION_CHANNELS
@@ -101,7 +101,7 @@ class _Parsed:
     tips: dict[int, list[float]] = field(default_factory=dict)
 
 
-def read_bvh(path: Path, *, up: Axis = "y", unit: Literal["m", "cm", "mm"] = "m") -> Motion:
+def read_bvh(path: Path, *, up: Axis = "y", unit: Literal["m", "cm", "mm"] = "m") -> MotionTree:
     """Read a BVH of any program: any channel order, any axes.
 
     Parameters
@@ -114,7 +114,7 @@ def read_bvh(path: Path, *, up: Axis = "y", unit: Literal["m", "cm", "mm"] = "m"
 
     Returns
     -------
-    Motion
+    MotionTree
         Metres, in the file's axes. Several ROOTs hang on a node `origin`.
 
     Raises
@@ -212,7 +212,7 @@ def _parse_motion(text: str, n_channels: int, path: Path) -> tuple[np.ndarray, f
     return values.reshape(n_frames, n_channels), frame_time
 
 
-def _to_motion(parsed: _Parsed, values: np.ndarray, fps: float, up: Axis, scale: float, path: Path) -> Motion:
+def _to_motion(parsed: _Parsed, values: np.ndarray, fps: float, up: Axis, scale: float, path: Path) -> MotionTree:
     T, n = len(values), len(parsed.names)
     offsets = np.array(parsed.offsets)
     rotations = np.tile(np.eye(3), (T, n, 1, 1))
@@ -239,7 +239,7 @@ def _to_motion(parsed: _Parsed, values: np.ndarray, fps: float, up: Axis, scale:
         rotations = np.concatenate([np.tile(np.eye(3), (T, 1, 1, 1)), rotations], axis=1)
         translations = np.concatenate([np.zeros((T, 1, 3)), translations], axis=1)
         moving, tips = np.concatenate([[False], moving]), np.concatenate([np.full((1, 3), np.nan), tips])
-    return Motion(
+    return MotionTree(
         names=tuple(names),
         parents=parents,
         offsets=offsets / scale,

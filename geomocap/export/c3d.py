@@ -13,23 +13,23 @@ import numpy as np
 
 import geomocap
 from geomocap.export.conventions import C3D, UNITS_PER_METRE, Axis
-from geomocap.export.errors import MotionError, require
+from geomocap.export.export_errors import MotionError, require
 from geomocap.export.markers import Markers
-from geomocap.export.motion import Motion
-from geomocap.files import write_atomic
+from geomocap.export.motion_tree import MotionTree
+from geomocap.files.atomic import write_atomic
 
 FINEST_RESIDUAL = 0.01  # mm; residuals are bytes, multiples of POINT:SCALE
 LABELS_PER_PARAMETER = 255  # a dimension of a C3D parameter is a byte
 
 
-def write_c3d(path: Path, markers: Markers, motion: Motion | None = None) -> None:
+def write_c3d(path: Path, markers: Markers, motion: MotionTree | None = None) -> None:
     """Write markers, and the bodies of a motion, as C3D, whole or not at all.
 
     Parameters
     ----------
     path : Path
     markers : Markers
-    motion : Motion, optional
+    motion : MotionTree, optional
         Its nodes become 4×4 transforms in the ROTATION group.
 
     Raises
@@ -81,7 +81,7 @@ def _residuals_mm(markers: Markers) -> np.ndarray:
     return np.where(markers.present, np.nan_to_num(known), -1.0)
 
 
-def _transforms(motion: Motion) -> np.ndarray:
+def _transforms(motion: MotionTree) -> np.ndarray:
     """4×4 transforms, world from node, in the file's axes and unit: (4, 4, N, T)."""
     R, p = motion.forward_kinematics()
     matrices = np.zeros((4, 4, motion.n_nodes, motion.n_frames))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomocap.export.conventions import Axis
-from geomocap.export.errors import MotionError
+from geomocap.export.export_errors import MotionError
 from geomocap.export.names import Names
 
 LEAST_RESIDUAL = 0.0001  # m; 0 stands for points that were not measured

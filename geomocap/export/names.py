@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geomocap.export.errors import MotionError
+from geomocap.export.export_errors import MotionError
 
 
 @dataclass(frozen=True)

@@ -8,27 +8,27 @@ from pathlib import Path
 
 import numpy as np
 
-from geomocap.articulation.model import MODEL_FILE, read_model
 from geomocap.errors import RunError
 from geomocap.export.bvh import write_bvh
 from geomocap.export.c3d import write_c3d
 from geomocap.export.conventions import Axis
-from geomocap.export.errors import MissingPackageError, MotionError
-from geomocap.export.gltf import write_glb
+from geomocap.export.export_errors import MissingPackageError, MotionError
+from geomocap.export.export_settings import ExportSettings
+from geomocap.export.glb import write_glb
 from geomocap.export.markers import Markers, markers_from_run
 from geomocap.export.model_skin import skin_from_model
-from geomocap.export.motion import Motion
+from geomocap.export.motion_tree import MotionTree
 from geomocap.export.names import Names
-from geomocap.export.settings import ExportSettings
 from geomocap.export.skeleton_motion import UNKNOWN_RADIUS, motion_from_skeleton
 from geomocap.export.skin import skin_from_run
 from geomocap.export.skinned_mesh import SkinnedMesh
 from geomocap.export.tables import motion_table, write_csv, write_parquet
 from geomocap.export.trc import write_trc
 from geomocap.export.usd import write_usd
+from geomocap.files.run import Run
 from geomocap.progress import Progress, silent
-from geomocap.run import Run
 from geomocap.settings import check_settings
+from geomocap.subject.subject_model import MODEL_FILE, read_model
 
 FILES = {
     "bvh": "motion.bvh",
@@ -161,7 +161,7 @@ def run_markers(
     return markers_from_run(skeleton, ellipsoids=shells, keypoints=keypoints, names=names, up=up)
 
 
-def surface_of_run(run: Run, motion: Motion, settings: ExportSettings) -> SkinnedMesh | None:
+def surface_of_run(run: Run, motion: MotionTree, settings: ExportSettings) -> SkinnedMesh | None:
     """Return the surface that GLB and USD show: the model's if there is one, else that of a frame; None: bones."""
     if settings.surface == "bones":
         return None
@@ -171,7 +171,7 @@ def surface_of_run(run: Run, motion: Motion, settings: ExportSettings) -> Skinne
 
 
 def _writers(
-    motion: Motion, markers: Markers, mesh: SkinnedMesh | None, settings: ExportSettings
+    motion: MotionTree, markers: Markers, mesh: SkinnedMesh | None, settings: ExportSettings
 ) -> dict[str, Callable[[Path], None]]:
     return {
         "bvh": lambda path: write_bvh(path, motion, unit=settings.bvh_unit),

@@ -13,16 +13,16 @@ from typing import Literal
 
 import numpy as np
 
+from geomocap.export.body_tree import BodyTree, body_tree
 from geomocap.export.conventions import Axis
-from geomocap.export.errors import MotionError
-from geomocap.export.hierarchy import BodyTree, body_tree
-from geomocap.export.motion import Motion
+from geomocap.export.export_errors import MotionError
+from geomocap.export.file_rotations import fill_positions, fill_rotations
+from geomocap.export.motion_tree import MotionTree
 from geomocap.export.names import Names
-from geomocap.export.rotations import fill_positions, fill_rotations
 
 JointMode = Literal["auto", "fixed", "moving"]
 FIXED_WITHIN = 1e-5  # m: a joint that stays this near its mean place in the parent body is fixed; ten add up to 0.1 mm
-SHORTEST_TIP, END_BONE = 0.0005, 0.03  # shares of the skeleton's extent: shorter tips are replaced by end bones
+SHORTEST_TIP, END_BONE = 0.0005, 0.03  # fractions of the skeleton's diagonal: shorter tips are replaced by end bones
 UNKNOWN_RADIUS = 0.05  # m
 ORIGIN = "origin"
 
@@ -35,7 +35,7 @@ def motion_from_skeleton(
     joints: JointMode = "auto",
     source: str = "skeleton.npz",
     radius: float = UNKNOWN_RADIUS,
-) -> Motion:
+) -> MotionTree:
     """Make a motion of the arrays of `skeleton.npz`.
 
     Gaps (NaN) are filled: rotations and positions between their neighbours in time, fixed joints by their offset.
@@ -199,10 +199,10 @@ class _Chain:
             self.node_of_body[body] = len(self.nodes)
         self.nodes.append(_Node(name, index, body, joint, moving, local, turn, world, R))
 
-    def motion(self, fps: float) -> Motion:
+    def motion(self, fps: float) -> MotionTree:
         """Return the finished motion."""
         nodes = self.nodes
-        return Motion(
+        return MotionTree(
             names=tuple(n.name for n in nodes),
             parents=np.array([n.parent for n in nodes]),
             offsets=np.stack([n.local[0] for n in nodes]),
@@ -221,8 +221,8 @@ class _Chain:
 
         A bone needs some length to be seen: where joint and centre coincide it points up.
         """
-        extent = self._extent()
-        end = (END_BONE * extent or self.radius) * np.eye(3)["xyz".index(self.up)]
+        diagonal = self._diagonal()
+        end = (END_BONE * diagonal or self.radius) * np.eye(3)["xyz".index(self.up)]
         parents = {n.parent for n in self.nodes}
         tips = np.full((len(self.nodes), 3), np.nan)
         for i, node in enumerate(self.nodes):
@@ -234,11 +234,11 @@ class _Chain:
                 local = np.einsum("tji,tj->ti", node.world_rotation, to_centre)
                 good = np.isfinite(local).all(axis=1)
                 tips[i] = 2 * local[good].mean(axis=0) if good.any() else 0.0
-            if np.linalg.norm(tips[i]) <= SHORTEST_TIP * extent:
+            if np.linalg.norm(tips[i]) <= SHORTEST_TIP * diagonal:
                 tips[i] = end
         return tips
 
-    def _extent(self) -> float:
+    def _diagonal(self) -> float:
         """Diagonal of the box around joints and bodies' centres in the first frame, metres; 0 of a single body."""
         centers = [fill_positions(p)[0] for p in self.body_positions.swapaxes(0, 1)]
         places = [node.world_origin[0] for node in self.nodes if node.body >= 0 or node.joint >= 0]

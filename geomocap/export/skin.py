@@ -10,27 +10,27 @@ import open3d as o3d
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from geomocap.export.errors import MotionError
-from geomocap.export.motion import Motion
-from geomocap.export.settings import ExportSettings
+from geomocap.export.export_errors import MotionError
+from geomocap.export.export_settings import ExportSettings
+from geomocap.export.motion_tree import MotionTree
 from geomocap.export.skinned_mesh import INFLUENCES, SkinnedMesh
-from geomocap.export.surface import Surface, surface_through
-from geomocap.geometry import Voxels
-from geomocap.open3d_files import read_by_open3d
-from geomocap.run import Run
+from geomocap.files.open3d_geometry import read_by_open3d
+from geomocap.files.run import Run
+from geomocap.model.frame_geometry import Voxels
+from geomocap.model.surface import Surface, surface_through
 
 VOTERS = 15  # points that say which body a vertex belongs to
-STEP = 0.5  # of the diffusion: the share of its neighbours' mean that a vertex takes on
+STEP = 0.5  # of the diffusion: the fraction of its neighbours' mean that a vertex takes on
 
 
-def skin_from_run(run: Run, motion: Motion, settings: ExportSettings) -> SkinnedMesh:
+def skin_from_run(run: Run, motion: MotionTree, settings: ExportSettings) -> SkinnedMesh:
     """Mesh a run's surface in the reference frame and bind it to the motion.
 
     Parameters
     ----------
     run : Run
         With `bodies/`; for true colours with `voxels/` or `cloud/`.
-    motion : Motion
+    motion : MotionTree
     settings : ExportSettings
 
     Raises
@@ -46,10 +46,10 @@ def skin_from_run(run: Run, motion: Motion, settings: ExportSettings) -> Skinned
     if settings.skin_colors == "true":
         colors = _true_colors(run, frame, points)
     surface = surface_through(points, normals, settings.skin_triangles)
-    extent = float(np.ptp(points, axis=0).max())
+    diagonal = float(np.ptp(points, axis=0).max())
     known = labels >= 0
     body = majority(points[known], labels[known], surface.vertices)
-    nodes, weights = skin_weights(surface, node_of_body(motion, body), motion.n_nodes, settings.skin_blend * extent)
+    nodes, weights = skin_weights(surface, node_of_body(motion, body), motion.n_nodes, settings.skin_blend * diagonal)
     if settings.skin_colors == "true":
         tint = colors[cKDTree(points).query(surface.vertices)[1]]
     else:
@@ -126,7 +126,7 @@ def skin_weights(surface: Surface, node: np.ndarray, n_nodes: int, blend: float)
     return nodes, weights / weights.sum(axis=1, keepdims=True)
 
 
-def node_of_body(motion: Motion, bodies: np.ndarray) -> np.ndarray:
+def node_of_body(motion: MotionTree, bodies: np.ndarray) -> np.ndarray:
     """Nodes of the motion that are these bodies, (N,) int."""
     table = np.full(max(int(motion.bodies.max()), int(bodies.max(initial=0))) + 1, -1)
     table[motion.bodies[motion.bodies >= 0]] = np.flatnonzero(motion.bodies >= 0)

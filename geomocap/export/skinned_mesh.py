@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomocap.export.errors import MotionError
-from geomocap.export.motion import Motion
-from geomocap.palette import body_colors
+from geomocap.export.export_errors import MotionError
+from geomocap.export.motion_tree import MotionTree
+from geomocap.model.palette import body_colors
 
 CORNERS = 24  # of a bone's eight triangles
 INFLUENCES = 4  # nodes that may move a vertex, as glTF's JOINTS_0 holds them
@@ -49,7 +49,7 @@ class SkinnedMesh:
             if getattr(self, name).shape != shape:
                 raise MotionError(f"skin: {name} has shape {getattr(self, name).shape}, expected {shape}")
 
-    def posed(self, motion: Motion) -> np.ndarray:
+    def posed(self, motion: MotionTree) -> np.ndarray:
         """Vertices in every frame of the motion: (T, V, 3) metres, world."""
         R, p = motion.forward_kinematics()
         # Vertices in the axes of the nodes that carry them, as they were bound.
@@ -62,14 +62,14 @@ class SkinnedMesh:
         return posed
 
 
-def bone_mesh(motion: Motion, thickness: float = 0.12) -> SkinnedMesh:
+def bone_mesh(motion: MotionTree, thickness: float = 0.12) -> SkinnedMesh:
     """Make a long octahedron for every bone, so that a skeleton can be seen in any viewer.
 
     Parameters
     ----------
-    motion : Motion
+    motion : MotionTree
     thickness : float
-        Half width of a bone as a share of its length.
+        Half width of a bone as a fraction of its length.
     """
     R, p = motion.forward_kinematics()
     bones = _bones(motion, p[0], R[0])
@@ -86,7 +86,7 @@ def bone_mesh(motion: Motion, thickness: float = 0.12) -> SkinnedMesh:
     return SkinnedMesh(corners, np.repeat(normal, 3, axis=0), faces, colors, carrier, weights)
 
 
-def _bones(motion: Motion, p: np.ndarray, R: np.ndarray) -> list[tuple[int, np.ndarray, np.ndarray]]:
+def _bones(motion: MotionTree, p: np.ndarray, R: np.ndarray) -> list[tuple[int, np.ndarray, np.ndarray]]:
     """Node that carries it, start and end of every bone in the first frame."""
     bones = [
         (int(motion.parents[n]), p[motion.parents[n]], p[n])

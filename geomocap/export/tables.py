@@ -20,21 +20,21 @@ from pathlib import Path
 
 import numpy as np
 
-from geomocap.export.errors import MotionError, require
+from geomocap.export.export_errors import MotionError, require
+from geomocap.export.file_rotations import zxy_angles
 from geomocap.export.markers import Markers
-from geomocap.export.motion import Motion
-from geomocap.export.rotations import zxy_angles
-from geomocap.files import write_atomic, write_text
+from geomocap.export.motion_tree import MotionTree
+from geomocap.files.atomic import write_atomic, write_text
 
 
-def motion_table(markers: Markers, motion: Motion) -> dict[str, np.ndarray]:
+def motion_table(markers: Markers, motion: MotionTree) -> dict[str, np.ndarray]:
     """Return the table's columns, each (T,).
 
     Parameters
     ----------
     markers : Markers
         Joints and other points.
-    motion : Motion
+    motion : MotionTree
         Of the same frames.
 
     Raises

@@ -11,9 +11,9 @@ from typing import Literal
 import numpy as np
 
 from geomocap.export.conventions import TRC, UNITS_PER_METRE, Axis, Convention
-from geomocap.export.errors import MotionError
+from geomocap.export.export_errors import MotionError
 from geomocap.export.markers import Markers
-from geomocap.files import write_text
+from geomocap.files.atomic import write_text
 
 DECIMALS = {"mm": 4, "m": 7}
 

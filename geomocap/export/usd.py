@@ -11,23 +11,23 @@ from typing import Any
 import numpy as np
 
 from geomocap.export.conventions import USD
-from geomocap.export.errors import require
-from geomocap.export.gltf import linear_light
-from geomocap.export.motion import Motion
-from geomocap.export.rotations import quaternions
+from geomocap.export.export_errors import require
+from geomocap.export.file_rotations import quaternions
+from geomocap.export.glb import linear_light
+from geomocap.export.motion_tree import MotionTree
 from geomocap.export.skinned_mesh import INFLUENCES, SkinnedMesh, bone_mesh
-from geomocap.files import write_atomic
+from geomocap.files.atomic import write_atomic
 
 ROOT, SKELETON, ANIMATION, SURFACE = "/subject", "/subject/skeleton", "/subject/skeleton/motion", "/subject/surface"
 
 
-def write_usd(path: Path, motion: Motion, mesh: SkinnedMesh | None = None) -> None:
+def write_usd(path: Path, motion: MotionTree, mesh: SkinnedMesh | None = None) -> None:
     """Write a motion as USD, whole or not at all; `.usda` is text, `.usdc` and `.usd` are binary.
 
     Parameters
     ----------
     path : Path
-    motion : Motion
+    motion : MotionTree
         In world axes, metres.
     mesh : SkinnedMesh, optional
         The surface that it moves; without one, a bone for each node.
@@ -41,7 +41,7 @@ def write_usd(path: Path, motion: Motion, mesh: SkinnedMesh | None = None) -> No
     write_atomic(path, lambda p: _write(p, motion, mesh or bone_mesh(motion)))
 
 
-def _write(path: Path, motion: Motion, mesh: SkinnedMesh) -> None:
+def _write(path: Path, motion: MotionTree, mesh: SkinnedMesh) -> None:
     from pxr import Usd, UsdGeom, UsdSkel
 
     stage = Usd.Stage.CreateNew(str(path))
@@ -61,7 +61,7 @@ def _write(path: Path, motion: Motion, mesh: SkinnedMesh) -> None:
     stage.GetRootLayer().Save()
 
 
-def _joint_paths(motion: Motion) -> list[str]:
+def _joint_paths(motion: MotionTree) -> list[str]:
     """Names as UsdSkel wants them: parent/child/grandchild, each a valid identifier."""
     from pxr import Tf
 
@@ -83,7 +83,7 @@ def _matrices(rotations: np.ndarray, positions: np.ndarray) -> Any:
     return Vt.Matrix4dArray.FromNumpy(matrices)
 
 
-def _add_skeleton(stage: Any, motion: Motion, joints: list[str], bind_frame: int) -> None:
+def _add_skeleton(stage: Any, motion: MotionTree, joints: list[str], bind_frame: int) -> None:
     from pxr import UsdSkel
 
     R, p = motion.forward_kinematics()
@@ -95,7 +95,7 @@ def _add_skeleton(stage: Any, motion: Motion, joints: list[str], bind_frame: int
     binding.CreateAnimationSourceRel().SetTargets([ANIMATION])
 
 
-def _add_animation(stage: Any, motion: Motion, joints: list[str]) -> None:
+def _add_animation(stage: Any, motion: MotionTree, joints: list[str]) -> None:
     from pxr import Gf, UsdSkel, Vt
 
     animation = UsdSkel.Animation.Define(stage, ANIMATION)
@@ -108,7 +108,7 @@ def _add_animation(stage: Any, motion: Motion, joints: list[str]) -> None:
         rotations.Set(Vt.QuatfArray([Gf.Quatf(w, x, y, z) for x, y, z, w in q[t].tolist()]), t)
 
 
-def _add_surface(stage: Any, mesh: SkinnedMesh, motion: Motion) -> None:
+def _add_surface(stage: Any, mesh: SkinnedMesh, motion: MotionTree) -> None:
     from pxr import Gf, UsdGeom, UsdSkel, Vt
 
     surface = UsdGeom.Mesh.Define(stage, SURFACE)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from geomocap.cameras import Rig
 from geomocap.errors import GeomocapError
 from geomocap.inspection.description import Description, count
+from geomocap.model.rig import Rig
 
 LEAST_BASELINE = 0.01  # m; cameras nearer than this to each other see no depth
 FARTHEST = 1000.0  # m

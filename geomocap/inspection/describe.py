@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from geomocap.errors import GeomocapError
+from geomocap.files.scan_geometry import SCAN_ENDINGS
 from geomocap.inspection.calibrations import describe_calibration
-from geomocap.inspection.captures import describe_capture
+from geomocap.inspection.capture_description import describe_capture
 from geomocap.inspection.description import Description
 from geomocap.inspection.motion_files import ENDINGS, describe_motion_file
 from geomocap.inspection.runs import describe_run
-from geomocap.inspection.scans import describe_scans
+from geomocap.inspection.scan_description import describe_scans
 from geomocap.inspection.truths import describe_truth
-from geomocap.scan_files import SCAN_ENDINGS
 
 
 class InspectionError(GeomocapError):

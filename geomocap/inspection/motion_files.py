@@ -12,7 +12,7 @@ from geomocap.errors import GeomocapError
 from geomocap.export.bvh import read_bvh
 from geomocap.export.c3d import read_c3d
 from geomocap.export.markers import Markers
-from geomocap.export.motion import Motion
+from geomocap.export.motion_tree import MotionTree
 from geomocap.export.trc import read_trc
 from geomocap.inspection.description import Description, count, shortened
 
@@ -44,7 +44,7 @@ def describe_motion_file(path: Path) -> Description:
     return told
 
 
-def _tell_tree(motion: Motion, told: Description) -> None:
+def _tell_tree(motion: MotionTree, told: Description) -> None:
     told.fact("joints", f"{motion.n_nodes}: {shortened(list(motion.names))}")
     moving = [n for k, n in enumerate(motion.names) if motion.moving[k] and motion.parents[k] >= 0]
     if moving:
@@ -68,9 +68,9 @@ def _tell_points(markers: Markers, told: Description) -> None:
     told.fact("gaps", f"{100 * (1 - present.mean()):.1f} %")
     seen = present.any(axis=1)
     boxes = np.nanmax(markers.positions[seen], axis=1) - np.nanmin(markers.positions[seen], axis=1)
-    extent = float(np.median(boxes.max(axis=1)))
-    if len(markers.names) > 1 and not EXTENTS[0] <= extent <= EXTENTS[1]:
-        told.problem(f"the points span {extent:.4g} m: the file's lengths are likely in another unit")
+    diagonal = float(np.median(boxes.max(axis=1)))
+    if len(markers.names) > 1 and not EXTENTS[0] <= diagonal <= EXTENTS[1]:
+        told.problem(f"the points span {diagonal:.4g} m: the file's lengths are likely in another unit")
     ever: list[bool] = np.any(present, axis=0).tolist()
     never = [n for n, p in zip(markers.names, ever, strict=True) if not p]
     if never:

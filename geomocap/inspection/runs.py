@@ -11,8 +11,8 @@ import numpy as np
 from geomocap.errors import GeomocapError
 from geomocap.export.run_export import FILES
 from geomocap.export.skeleton_motion import motion_from_skeleton
+from geomocap.files.run import Run
 from geomocap.inspection.description import Description, count, shortened
-from geomocap.run import Run
 
 
 def describe_run(path: Path) -> Description:

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from geomocap.cameras import Rig
 from geomocap.errors import CalibrationError
+from geomocap.model.rig import Rig
 
 _INDEX_FROM_PIXEL = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])
 _PIXEL_FROM_INDEX = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])

@@ -13,9 +13,9 @@ import numpy as np
 
 from geomocap.matching import grow_kernel as gk
 from geomocap.matching import patch_kernel as pk
-from geomocap.matching.grid import Grid
+from geomocap.matching.match_grid import MatchGrid
+from geomocap.matching.matching_settings import GrowingSettings, KernelSettings
 from geomocap.matching.seeds import Seeds
-from geomocap.matching.settings import GrowingSettings, KernelSettings
 from geomocap.matching.spline import ImageStack
 
 _LEFT, _RIGHT, _ABOVE, _BELOW = range(4)
@@ -56,7 +56,7 @@ class Front:
         Rounds in which a cell was tried in vain.
     """
 
-    grid: Grid
+    grid: MatchGrid
     images: ImageStack
     template: int
     searches: np.ndarray
@@ -73,7 +73,7 @@ class Front:
     @classmethod
     def over(
         cls,
-        grid: Grid,
+        grid: MatchGrid,
         images: ImageStack,
         template: int,
         searches: np.ndarray,

@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 
 from geomocap.matching import patch_kernel as pk
 from geomocap.matching.front import Front
-from geomocap.matching.grid import Grid
 from geomocap.matching.lsm import Matches, count_reasons, matches_of
+from geomocap.matching.match_grid import MatchGrid
+from geomocap.matching.matching_settings import GrowingSettings, KernelSettings
 from geomocap.matching.seeds import Seeds
-from geomocap.matching.settings import GrowingSettings, KernelSettings
 from geomocap.matching.spline import ImageStack
 
 STEP = 1.5  # distance of neighbouring cells if none is asked for, pixels
@@ -28,7 +28,7 @@ class SurfaceMatches:
     ----------
     template : int
     searches : (K,) int
-    grid : Grid
+    grid : MatchGrid
         N cells.
     matches : Matches
         Of leading shape (N, K); not matched where an image did not see the point.
@@ -47,7 +47,7 @@ class SurfaceMatches:
 
     template: int
     searches: np.ndarray
-    grid: Grid
+    grid: MatchGrid
     matches: Matches
     planes: np.ndarray
     matched: np.ndarray
@@ -105,7 +105,7 @@ def grow(
     settings, kernel = settings or GrowingSettings(), kernel or KernelSettings()
     searches = np.asarray(searches, dtype=np.int64)
     height, width = (int(v) for v in images.layout[template, 2:])
-    grid = Grid.over((height, width), settings.step or STEP, mask)
+    grid = MatchGrid.over((height, width), settings.step or STEP, mask)
     front = Front.over(grid, images, template, searches, transfers, settings, kernel, least_images)
 
     # Voronoi regions of the seeds; each begins at the cell nearest to its seed
@@ -125,7 +125,7 @@ def grow(
     return SurfaceMatches(template, searches, grid, matches, planes, kept, removed, region, seeds, reasons)
 
 
-def regions(grid: Grid, seeds: Seeds) -> tuple[np.ndarray, np.ndarray]:
+def regions(grid: MatchGrid, seeds: Seeds) -> tuple[np.ndarray, np.ndarray]:
     """Voronoi tessellation of the cells.
 
     Returns
@@ -145,7 +145,7 @@ def regions(grid: Grid, seeds: Seeds) -> tuple[np.ndarray, np.ndarray]:
     return region, begin
 
 
-def consistent(grid: Grid, matches: Matches, matched: np.ndarray, settings: GrowingSettings) -> np.ndarray:
+def consistent(grid: MatchGrid, matches: Matches, matched: np.ndarray, settings: GrowingSettings) -> np.ndarray:
     """Say which matched cells agree with their neighbours.
 
     Two neighbours agree if, in every image that saw both, each lies where the other's affine matrix predicts it. A

@@ -23,7 +23,7 @@ six unknowns for each image are eliminated and a scalar equation for μ is left 
 constrained multiphoto matching", with the collinearity equations written along the template ray).
 
 Precision. s² = Σe² / (P − 8) is the noise of *both* images. Two effects make the textbook covariance s² N⁻¹ wrong:
-interpolation between pixels smooths white noise (a share a(t) of its variance is left), so s² underestimates the
+interpolation between pixels smooths white noise (a fraction a(t) of its variance is left), so s² underestimates the
 noise at the scale of the texture; and noise in the template's slopes inflates N. With σ² = s² / (a_f + a_g) the noise
 variance of one image, in units of f, and B = diag of Σ(noise of the slopes)², the covariance used here is
 
@@ -42,8 +42,8 @@ import numpy as np
 from numba import njit, prange
 
 from geomocap.matching import patch_kernel as kernel
+from geomocap.matching.matching_settings import KernelSettings
 from geomocap.matching.patch_kernel import match_patch, workspace
-from geomocap.matching.settings import KernelSettings
 from geomocap.matching.spline import ImageStack, SplineImage
 
 REASONS = (

@@ -45,7 +45,7 @@ def solve(L, b, x):
 
 @njit(cache=True, nogil=True)
 def noise_kept(order, x, y, a11, a12, a21, a22, radius):
-    """Share of white noise that spline values of a warped patch keep on average (product of two `NOISE_VALUE`).
+    """Fraction of white noise that spline values of a warped patch keep on average (product of two `NOISE_VALUE`).
 
     The mean of cos 2π(x + u i + v j) over the square patch is cos 2πx D(u) D(v) with D the Dirichlet kernel.
     """

@@ -218,10 +218,10 @@ def match_patch(
                 quality[k, STATUS] = CORRELATION
                 use[k] = 0.0
                 continue
-            # The residual stands on the search image, not on f: its share along f goes with the gain
-            share = correlation * correlation
+            # The residual stands on the search image, not on f: its fraction along f goes with the gain
+            fraction = correlation * correlation
             for i in range(6):
-                systems[k, 0, i] = gain * (b[i] - off * q1[i]) - share * qf[i]
+                systems[k, 0, i] = gain * (b[i] - off * q1[i]) - fraction * qf[i]
         # Solve: each image for itself, or all through the one unknown that they share, the inverse depth.
         step = 0.0
         if condition:

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomocap.matching.foerstner import interest_points
+from geomocap.matching.matching_settings import SeedSettings
 from geomocap.matching.plane_sweep import SweepImages, sweep
-from geomocap.matching.settings import SeedSettings
 
 REASONS = ("seed found", "seed without depth range", "seed of low correlation", "seed not unique", "images disagree")
 

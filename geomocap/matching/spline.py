@@ -227,7 +227,7 @@ def _sample_points(flat, layout, order, pixels, out):
 
 
 NOISE_VALUE = np.array([[0.87625, 0.12375], [0.918, 0.082]])
-"""Share of white pixel noise that a spline value keeps, as a function of the fraction t, for cubic and quintic:
+"""Fraction of white pixel noise that a spline value keeps, as a function of the fraction t, for cubic and quintic:
 a(t) = Σ_k η(k + t)² ≈ A₀ + A₁ cos 2πt, with η the cardinal spline; 1 on a pixel, 0.756 between two (cubic)."""
 
 NOISE_SLOPE = np.array([1.392305, 1.893964])

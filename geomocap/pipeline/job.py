@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import geomocap
-from geomocap.capture import Capture
 from geomocap.config import Config
+from geomocap.files.capture import Capture
+from geomocap.files.run import Run
+from geomocap.files.scans import Scans
 from geomocap.progress import Progress, silent
-from geomocap.run import Run
-from geomocap.scans import Scans
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Job:
     fps : float
         Frames per second.
     model : Path, optional
-        `model.npz` of the subject, from another take.
+        `model.npz` of the subject, from another sequence.
     """
 
     run: Run

@@ -8,12 +8,12 @@ from typing import Literal
 import numpy as np
 
 from geomocap.errors import GeometryError
-from geomocap.geometry import Geometry, Voxels, read_cloud, read_cloud_colors
-from geomocap.pipeline.clouds import clouds
+from geomocap.files.run import Run, stage_key
+from geomocap.files.scans import point_spacing
+from geomocap.model.frame_geometry import Geometry, Voxels, read_cloud, read_cloud_colors
+from geomocap.pipeline.cloud_stage import clouds
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.voxels import voxels
-from geomocap.run import Run, stage_key
-from geomocap.scans import point_spacing
+from geomocap.pipeline.voxel_stage import voxels
 
 Source = Literal["voxels", "cloud", "scans"]
 

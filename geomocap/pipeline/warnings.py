@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 
-from geomocap.files import write_text
-from geomocap.run import Run
+from geomocap.files.atomic import write_text
+from geomocap.files.run import Run
 
 WARNINGS_FILE = "diagnostics.json"
 

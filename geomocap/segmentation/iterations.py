@@ -10,10 +10,10 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from geomocap.errors import GeometryError
-from geomocap.segmentation.bodies import Grouping, group_paths, path_integrals
+from geomocap.model.ellipsoids import Ellipsoids
 from geomocap.segmentation.contacts import count_contacts
-from geomocap.segmentation.ellipsoids import Ellipsoids
-from geomocap.segmentation.matching import Paths
+from geomocap.segmentation.ellipsoid_matching import EllipsoidPaths
+from geomocap.segmentation.relative_paths import Grouping, group_paths, path_integrals
 
 _ISOLATED = 0.5
 
@@ -23,13 +23,13 @@ def _subset(points: Callable[[int], np.ndarray], members: list[np.ndarray], fram
 
 
 def peel_bodies(
-    run: Callable[[Callable[[int], np.ndarray]], Paths],
+    run: Callable[[Callable[[int], np.ndarray]], EllipsoidPaths],
     points: Callable[[int], np.ndarray],
-    paths: Paths,
+    paths: EllipsoidPaths,
     threshold: float,
     min_points: int,
     spacing: float,
-) -> tuple[Paths, Grouping]:
+) -> tuple[EllipsoidPaths, Grouping]:
     """Find bodies from the largest outward.
 
     The largest body of a set is taken out of all frames. What is left falls into isolated sets: ellipsoids that touch,
@@ -42,7 +42,7 @@ def peel_bodies(
         Gives the paths of a part of the points.
     points : callable
         All points of a frame.
-    paths : Paths
+    paths : EllipsoidPaths
         Those of the whole.
     threshold : float, metres
     min_points : int
@@ -51,20 +51,20 @@ def peel_bodies(
 
     Returns
     -------
-    Paths
+    EllipsoidPaths
         All ellipsoids of all final sets.
     Grouping
         Bodies in the order in which they were found.
     """
     frames = len(paths.labels)
     everything = [np.arange(len(labels), dtype=np.int32) for labels in paths.labels]
-    queue: deque[tuple[Paths, list[np.ndarray]]] = deque([(paths, everything)])
+    queue: deque[tuple[EllipsoidPaths, list[np.ndarray]]] = deque([(paths, everything)])
     parts: list[tuple[Ellipsoids, int]] = []
     labels = [np.full(len(these), -1, np.int16) for these in paths.labels]
     seeds: list[int] = []
     total = 0
 
-    def keep(found: Paths, members: list[np.ndarray], chosen: np.ndarray, seed: int) -> None:
+    def keep(found: EllipsoidPaths, members: list[np.ndarray], chosen: np.ndarray, seed: int) -> None:
         nonlocal total
         number = np.full(found.ellipsoids.counts.shape[1], -1, np.int16)
         number[chosen] = total + np.arange(len(chosen))
@@ -106,7 +106,7 @@ def peel_bodies(
     ellipsoids = _join([part for part, _ in parts])
     body = np.repeat(np.arange(len(parts), dtype=np.int32), [n for _, n in parts])
     contacts, touching = _contacts(points, labels, total, spacing)
-    joined = Paths(ellipsoids, tuple(labels), contacts, touching, paths.repaired)
+    joined = EllipsoidPaths(ellipsoids, tuple(labels), contacts, touching, paths.repaired)
     integrals = path_integrals(ellipsoids.centers)
     return joined, Grouping(body, np.array(seeds, np.int32), integrals, threshold)
 

@@ -9,15 +9,15 @@ from functools import partial
 import numpy as np
 
 from geomocap.errors import GeometryError
+from geomocap.model.rotations import body_rotations
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items
-from geomocap.segmentation.bodies import Grouping, group_paths, path_integrals, similarity_threshold, unite
+from geomocap.segmentation.ellipsoid_matching import EllipsoidPaths, match_frames
+from geomocap.segmentation.ellipsoid_splitting import SplitFrame, split_frame
 from geomocap.segmentation.iterations import peel_bodies
-from geomocap.segmentation.matching import Paths, match_frames
-from geomocap.segmentation.rotations import body_rotations
-from geomocap.segmentation.segmentation import Segmentation
-from geomocap.segmentation.settings import SegmentationSettings
-from geomocap.segmentation.splitting import SplitFrame, split_frame
+from geomocap.segmentation.m3_result import Segmentation
+from geomocap.segmentation.m3_settings import SegmentationSettings
+from geomocap.segmentation.relative_paths import Grouping, group_paths, path_integrals, similarity_threshold, unite
 
 Points = Callable[[int], np.ndarray]
 """Gives the (N, 3) points of a frame, metres, world; called when they are needed, more than once if iterative."""
@@ -70,7 +70,7 @@ def segment_m3(
     if not (np.isfinite(spacing) and spacing > 0):
         raise GeometryError(f"point spacing {spacing}: expected a positive length in metres")
 
-    def run(some: Points, some_progress: Progress = silent) -> Paths:
+    def run(some: Points, some_progress: Progress = silent) -> EllipsoidPaths:
         return ellipsoid_paths(some, frames, spacing, settings, executor, some_progress)
 
     # Steps 1 and 2: ellipsoids of every frame, matched from frame to frame
@@ -95,7 +95,7 @@ def ellipsoid_paths(
     settings: SegmentationSettings,
     executor: Executor | None = None,
     progress: Progress = silent,
-) -> Paths:
+) -> EllipsoidPaths:
     """Split every frame into ellipsoids, merge those of the first, and match them in time (sections 5 and 6).
 
     Parameters and errors as of `segment_m3`.
@@ -125,7 +125,7 @@ def _splits(
         progress("segment", frame + 1, frames)
 
 
-def _result(paths: Paths, grouping: Grouping, spacing: float) -> Segmentation:
+def _result(paths: EllipsoidPaths, grouping: Grouping, spacing: float) -> Segmentation:
     body = grouping.body
     count = len(grouping.seeds)
     bodies = unite(paths.ellipsoids, body, count)
@@ -149,7 +149,7 @@ def _result(paths: Paths, grouping: Grouping, spacing: float) -> Segmentation:
 
 
 def _touching(touching: np.ndarray, body: np.ndarray, count: int) -> np.ndarray:
-    """Share of the frames in which two bodies touch: that of their pair of ellipsoids that touches most."""
+    """Fraction of the frames in which two bodies touch: that of their pair of ellipsoids that touches most."""
     result = np.zeros((count, count))
     for a in range(count):
         for b in range(a):

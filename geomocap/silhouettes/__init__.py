@@ -3,7 +3,7 @@
 from geomocap.silhouettes.background import BackgroundModel, model_from_frames, model_from_plate
 from geomocap.silhouettes.extraction import coverage, silhouette
 from geomocap.silhouettes.region import region_of_box, region_of_points
-from geomocap.silhouettes.settings import SilhouetteSettings
+from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 __all__ = [
     "BackgroundModel",

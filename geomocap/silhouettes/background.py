@@ -11,7 +11,7 @@ from numba import njit, prange
 
 from geomocap.errors import CaptureError
 from geomocap.silhouettes.light import light_change
-from geomocap.silhouettes.settings import SilhouetteSettings
+from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 LEAST_NOISE = 0.7  # grey levels; 8-bit rounding alone gives 0.29, compression hides the rest in flat parts
 GRADIENT_BINS = 12

@@ -12,7 +12,7 @@ from geomocap.silhouettes.colors import color_evidence
 from geomocap.silhouettes.evidence import DOUBTFUL, LIMIT, background_evidence, shadow_evidence, smooth_evidence
 from geomocap.silhouettes.light import light_change
 from geomocap.silhouettes.outline import refine_outline
-from geomocap.silhouettes.settings import SilhouetteSettings
+from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 
 def silhouette(

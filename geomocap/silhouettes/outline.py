@@ -10,7 +10,7 @@ REACH = 3  # pixels from which the colours on either side are taken
 
 @njit(cache=True, nogil=True)
 def refine_outline(mask, image, mean, known, sigma, gain, offset, contrast):
-    """Decide the pixels on both sides of the outline by the subject's share of their colour.
+    """Decide the pixels on both sides of the outline by the subject's fraction of their colour.
 
     A pixel on the outline mixes the subject's colour F and the background's B, I = a F + (1 - a) B. B is known (shaded
     as the background pixels beside it), F is the mean of the subject's pixels nearby that aren't on the outline
@@ -68,13 +68,13 @@ def refine_outline(mask, image, mean, known, sigma, gain, offset, contrast):
             if inside == 0.0:
                 continue
             shade = min(max(seen / plain, 0.2), 1.5) if outside > 0.0 and plain > 0.0 else 1.0
-            step, share, spread = 0.0, 0.0, square / inside
+            step, fraction, spread = 0.0, 0.0, square / inside
             for c in range(3):
                 back[c] = shade * (gain[c] * mean[y, x, c] + offset[c])
                 front[c] /= inside
                 spread -= front[c] * front[c]
                 step += (front[c] - back[c]) ** 2
-                share += (image[y, x, c] - back[c]) * (front[c] - back[c])
+                fraction += (image[y, x, c] - back[c]) * (front[c] - back[c])
             if step > max((6.0 * sigma[y, x]) ** 2, contrast * contrast * spread):
-                result[y, x] = share >= 0.5 * step
+                result[y, x] = fraction >= 0.5 * step
     return result

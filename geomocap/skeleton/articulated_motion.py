@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomocap.segmentation.rotations import nearest_rotation
-from geomocap.skeleton.hierarchy import Hierarchy
+from geomocap.model.hierarchy import Hierarchy
+from geomocap.model.rotations import nearest_rotation
 
 
 @dataclass(frozen=True)

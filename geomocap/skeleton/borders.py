@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from geomocap.segmentation.motion_bodies import MotionBodies
-from geomocap.segmentation.surface_graph import frames_looked_at
+from geomocap.bodies.motion_bodies import MotionBodies
+from geomocap.bodies.surface_graph import frames_looked_at
 
 _NEAREST = 6
 _FRAMES = 10

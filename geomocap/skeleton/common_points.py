@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomocap.segmentation.rigid_motions import turn_angles
-from geomocap.segmentation.rotations import nearest_rotation
+from geomocap.bodies.rigid_motions import turn_angles
+from geomocap.model.rotations import nearest_rotation
 
 _ROUNDS = 6
-_INDEPENDENT = 0.2  # share of the frames; neighbouring ones err together
+_INDEPENDENT = 0.2  # fraction of the frames; neighbouring ones err together
 _LEAST_SPREAD = 1e-4
 
 
@@ -31,7 +31,7 @@ class CommonPoint:
     axis : (3,) float
         Axis of a hinge in frame 0, world; the mean axis for a ball.
     off_axis : float
-        Root mean square share of the turn about other axes: 0 for a perfect hinge.
+        Root mean square fraction of the turn about other axes: 0 for a perfect hinge.
     axis_std : float, radians
         Standard deviation of the axis' direction.
     hinge : bool
@@ -56,7 +56,7 @@ def common_point(
     prior: float,
     spread: float,
     noise: float,
-    hinge_share: float,
+    hinge_fraction: float,
 ) -> CommonPoint:
     """Least squares point c with R_a c + t_a = R_b c + t_b in all frames, drawn to the bodies' interface.
 
@@ -79,8 +79,8 @@ def common_point(
         How far from the middle of the interface a joint may be, standard deviation.
     noise : float, metres
         Misses below this are all the same.
-    hinge_share : float
-        A joint is a hinge if the turns about other axes are, root mean square, less than this share of all turns.
+    hinge_fraction : float
+        A joint is a hinge if the turns about other axes are, root mean square, less than this fraction of all turns.
     """
     turned = rotations[0] - rotations[1]
     apart = translations[1] - translations[0]
@@ -104,7 +104,7 @@ def common_point(
     relative = turn_angles(rotations[0].swapaxes(1, 2) @ rotations[1])
     turn = float(np.quantile(relative, 0.98))
     return CommonPoint(
-        point, np.sqrt(np.diag(covariance)), rms, turn, axis, off_axis, axis_std, bool(off_axis < hinge_share)
+        point, np.sqrt(np.diag(covariance)), rms, turn, axis, off_axis, axis_std, bool(off_axis < hinge_fraction)
     )
 
 

@@ -9,21 +9,21 @@ from pydantic import Field
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.errors import GeometryError
-from geomocap.segmentation.motion_bodies import MotionBodies
+from geomocap.model.hierarchy import Hierarchy
 from geomocap.settings import Settings
 from geomocap.skeleton.articulated_motion import fit_articulated, prior_moments
+from geomocap.skeleton.bone_motion import local_rotations
 from geomocap.skeleton.borders import Border, contacts, find_borders
 from geomocap.skeleton.common_points import CommonPoint, common_point
-from geomocap.skeleton.hierarchy import Hierarchy
-from geomocap.skeleton.motion import local_rotations
-from geomocap.skeleton.skeleton import Skeleton
+from geomocap.skeleton.m3_skeleton import Skeleton
 from geomocap.skeleton.spanning_tree import Connection, connect_by_cost, connection_cost
 from geomocap.skeleton.temporal_smoothing import smooth_positions, smooth_rotations
 
 _UNSEEN = 0.05
 _BRIDGE = 1e-3
-_LEAST_MISS = 5e-4  # extents
+_LEAST_MISS = 5e-4  # diagonals
 
 
 class MotionSkeletonSettings(Settings):
@@ -34,17 +34,17 @@ class MotionSkeletonSettings(Settings):
         gt=0,
         description="least weight of the place where bodies touch (frames in which they turn by a radian)",
     )
-    hinge_share: float = Field(
-        default=0.1, ge=0, lt=1, description="hinge: turns about other axes are less than this share of all (0..1)"
+    hinge_fraction: float = Field(
+        default=0.1, ge=0, lt=1, description="hinge: turns about other axes are less than this fraction of all (0..1)"
     )
     interface_weight: float = Field(
         default=0.05, ge=0, description="tree: weight of a joint's distance from where its bodies touch (no unit)"
     )
     gap_weight: float = Field(default=0.05, ge=0, description="tree: weight of the bodies' distance (no unit)")
     contact_weight: float = Field(
-        default=0.01, ge=0, description="tree: cost of bodies without common border (extents)"
+        default=0.01, ge=0, description="tree: cost of bodies without common border (diagonals)"
     )
-    largest_gap: float = Field(default=0.1, gt=0, description="bodies farther apart are not connected (extents)")
+    largest_gap: float = Field(default=0.1, gt=0, description="bodies farther apart are not connected (diagonals)")
     smoothing: float = Field(
         default=0.0, ge=0, description="weight of an even pace against the samples; 1 halves what changes in 3 frames"
     )
@@ -117,7 +117,7 @@ def _smooth_motion(bodies: MotionBodies, middle: np.ndarray, strength: float) ->
         bridged = strength if strength > 0 else (_BRIDGE if (weights < _UNSEEN).any() else 0.0)
         weights = np.where(weights < _UNSEEN, 0.0, weights)
         rotations[:, b] = smooth_rotations(bodies.rotations[:, b], weights, bridged)
-        path = smooth_positions(bodies.centers[:, b], weights, bridged, _LEAST_MISS * bodies.extent)
+        path = smooth_positions(bodies.centers[:, b], weights, bridged, _LEAST_MISS * bodies.diagonal)
         translations[:, b] = path - rotations[:, b] @ middle[b]
     return rotations, translations
 
@@ -125,15 +125,15 @@ def _smooth_motion(bodies: MotionBodies, middle: np.ndarray, strength: float) ->
 def possible_connections(bodies: MotionBodies, settings: MotionSkeletonSettings) -> list[Connection]:
     """Joints between all bodies that come near each other, and more until every body can be reached."""
     count = bodies.body_count
-    limit = settings.largest_gap * bodies.extent
+    limit = settings.largest_gap * bodies.diagonal
     borders = find_borders(bodies, limit)
     while connected_components(_reached(borders, count))[0] > 1:
         limit *= 2.0
         borders = find_borders(bodies, limit)
     contact = contacts(bodies)
     whole = np.maximum(contact.sum(axis=1), 1)
-    weights = (settings.interface_weight, settings.gap_weight, settings.contact_weight * bodies.extent)
-    noise = 2e-4 * bodies.extent
+    weights = (settings.interface_weight, settings.gap_weight, settings.contact_weight * bodies.diagonal)
+    noise = 2e-4 * bodies.diagonal
     result = []
     for (a, b), border in borders.items():
         motions = (
@@ -142,15 +142,15 @@ def possible_connections(bodies: MotionBodies, settings: MotionSkeletonSettings)
         )
         reliability = np.minimum(bodies.reliability[:, a], bodies.reliability[:, b]) + 1e-3
         interface = border.middle
-        certainty = (settings.interface_prior, border.spread, noise, settings.hinge_share)
+        certainty = (settings.interface_prior, border.spread, noise, settings.hinge_fraction)
         joint = common_point(*motions, reliability, interface, *certainty)
         if joint.hinge:
-            # every point of its axis is common: the joint is in the middle of what the bodies share of it
+            # every point of its axis is common: the joint is in the middle of what the bodies fraction of it
             interface = border.middle_along(joint.point, joint.axis)
             joint = common_point(*motions, reliability, interface, *certainty)
         off = float(np.linalg.norm(joint.point - interface))
-        share = float(contact[a, b] / min(whole[a], whole[b]))
-        cost = connection_cost(joint.miss, off, border.gap, share, weights)
+        fraction = float(contact[a, b] / min(whole[a], whole[b]))
+        cost = connection_cost(joint.miss, off, border.gap, fraction, weights)
         result.append(Connection((a, b), joint, interface, border.gap, cost))
     return result
 

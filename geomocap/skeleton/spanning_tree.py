@@ -8,8 +8,8 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 
+from geomocap.model.hierarchy import Hierarchy
 from geomocap.skeleton.common_points import CommonPoint
-from geomocap.skeleton.hierarchy import Hierarchy
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def connection_cost(
     gap : float, metres
         Distance of the bodies.
     contact : float
-        Length of the border between them as a share of what the smaller of the two has in all, 0 to 1.
+        Length of the border between them as a fraction of what the smaller of the two has in all, 0 to 1.
     weights : three floats
         Of distance from the interface and gap (no unit), and of missing contact (metres).
     """
@@ -69,7 +69,7 @@ def connect_by_cost(
         All pairs of bodies must be connected through them.
     bodies : int
     sizes : (B,) float
-        Share of the samples.
+        Fraction of the samples.
 
     Returns
     -------

@@ -64,9 +64,9 @@ def smooth_positions(positions: np.ndarray, weights: np.ndarray, strength: float
 def _interpolate(observed: Rotation, known: np.ndarray, frames: int) -> Rotation:
     """Rotations of all frames: known ones, and even turns between them."""
     at = np.clip(np.searchsorted(known, np.arange(frames), side="right") - 1, 0, len(known) - 2)
-    share = np.clip((np.arange(frames) - known[at]) / (known[at + 1] - known[at]), 0.0, 1.0)
+    fraction = np.clip((np.arange(frames) - known[at]) / (known[at + 1] - known[at]), 0.0, 1.0)
     step = (observed[known[at + 1]] * observed[known[at]].inv()).as_rotvec()
-    return Rotation.from_rotvec(share[:, None] * step) * observed[known[at]]
+    return Rotation.from_rotvec(fraction[:, None] * step) * observed[known[at]]
 
 
 def _whittaker(target: np.ndarray, bend: np.ndarray, weights: np.ndarray, strength: float) -> np.ndarray:

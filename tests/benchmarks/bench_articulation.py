@@ -6,11 +6,11 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.sparse import lil_matrix
 
-from geomocap.articulation.adjustment import adjust
-from geomocap.articulation.kinematics import Linkage, body_motion, joint_motion, moved_by
-from geomocap.articulation.observations import Observations, SkinPoints
-from geomocap.articulation.smoothness import Smoothness, accelerations
-from geomocap.skeleton.hierarchy import Hierarchy
+from geomocap.model.hierarchy import Hierarchy
+from geomocap.skeleton.articulated_adjustment import adjust
+from geomocap.skeleton.body_observations import Observations, SkinPoints
+from geomocap.skeleton.kinematics import Linkage, body_motion, joint_motion, moved_by
+from geomocap.skeleton.motion_smoothness import Smoothness, accelerations
 from tests.benchmarks.table import Row, measure
 from tests.geomocap.moving_chains import Chain, chain
 
@@ -38,7 +38,7 @@ def benchmark() -> list[Row]:
 
 
 def _problem(scene: Chain):
-    """Linkage, disturbed start, skin and sightings of a chain."""
+    """Linkage, disturbed start, skin and observations of a chain."""
     count = len(scene.joints) + 1
     hierarchy = Hierarchy(0, np.array([[b, b + 1] for b in range(count - 1)], np.int32))
     origin = scene.positions[scene.body == 0, 0].mean(axis=0)
@@ -55,8 +55,8 @@ def _prior(linkage: Linkage) -> Smoothness:
 
 
 def _ours(linkage, motion, points, positions):
-    sightings = Observations.of_paths(positions, np.full(positions.shape[:2], SIGMA))
-    found = adjust(linkage, motion, points, sightings, smoothness=_prior(linkage), cutoff=1e6, rounds=10)
+    observations = Observations.of_paths(positions, np.full(positions.shape[:2], SIGMA))
+    found = adjust(linkage, motion, points, observations, smoothness=_prior(linkage), cutoff=1e6, rounds=10)
     return found.motion
 
 
@@ -66,7 +66,7 @@ def _scipy(linkage, motion, points, positions):
 
     def residuals(step):
         moved = moved_by(linkage, motion, step.reshape(frames, size))
-        placed = body_motion(linkage, moved).carry(points.rest, points.bodies, points.shares)
+        placed = body_motion(linkage, moved).carry(points.rest, points.bodies, points.fractions)
         data = (placed - positions.swapaxes(0, 1)) / SIGMA
         return np.concatenate([data.ravel(), (accelerations(linkage, moved) / scale).ravel()])
 
@@ -83,5 +83,5 @@ def _scipy(linkage, motion, points, positions):
 
 def _miss(problem, motion) -> float:
     linkage, _, points, positions = problem
-    placed = body_motion(linkage, motion).carry(points.rest, points.bodies, points.shares)
+    placed = body_motion(linkage, motion).carry(points.rest, points.bodies, points.fractions)
     return float(np.linalg.norm(placed - positions.swapaxes(0, 1), axis=2).max())

@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import coo_matrix
 from scipy.spatial.transform import Rotation
 
-from geomocap.calibration.adjustment import Adjusted, adjust, image_residuals
+from geomocap.calibration.bundle_adjustment import AdjustedNetwork, adjust, image_residuals
 from geomocap.calibration.ceres import adjust_with_ceres
 from geomocap.calibration.network import Network
 from geomocap.calibration.projection import project_point
@@ -87,7 +87,7 @@ def benchmark() -> list[Row]:
         ("8 cameras × 500 bars", eight_cameras(1, 500), "≤ 2 s"),
     ):
         network = disturbed_network(scene, 0.05, seed=2)
-        kept: list[Adjusted] = []
+        kept: list[AdjustedNetwork] = []
         ours = measure(lambda network=network, kept=kept: kept.append(adjust(network)), repeat=3)  # type: ignore[misc]
         result = kept[-1]
         seconds, cost = by_scipy(network)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import open3d as o3d
 
-from geomocap.carving.bounds import subject_box
+from geomocap.carving.carving_settings import CarvingSettings, ConsistencySettings, HullSettings
 from geomocap.carving.frames import carve_frame
-from geomocap.carving.grid import Grid
 from geomocap.carving.hull import hull, hull_surface, visual_hull
 from geomocap.carving.reference import visual_hull_brute, visual_hull_numpy
-from geomocap.carving.settings import CarvingSettings, ConsistencySettings, HullSettings
-from geomocap.carving.views import PinholeViews
+from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.carving.subject_bounds import subject_box
 from geomocap.carving.visibility import SurfaceVoxels, depth_buffers
+from geomocap.carving.voxel_grid import Grid
 from tests.benchmarks.table import Row, measure
 from tests.geomocap.carving_scenes import FIGURE, ring, silhouettes
 

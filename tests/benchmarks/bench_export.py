@@ -9,7 +9,7 @@ import tempfile
 from pathlib import Path
 
 from geomocap.export.bvh import read_bvh, write_bvh
-from geomocap.export.gltf import write_glb
+from geomocap.export.glb import write_glb
 from geomocap.export.markers import markers_from_run
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.trc import write_trc

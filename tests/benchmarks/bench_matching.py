@@ -13,18 +13,18 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from data_tools.gltf import load_gltf
+from data_tools.gltf_reader import load_gltf
 from data_tools.synthesize import SynthesisSettings, synthesize
-from geomocap.cameras import Rig
+from geomocap.carving.carving_settings import CarvingSettings
 from geomocap.carving.frames import carve_frame
-from geomocap.carving.settings import CarvingSettings
-from geomocap.carving.views import Undistortion
+from geomocap.carving.silhouette_views import Undistortion
 from geomocap.carving.volume import working_volume
-from geomocap.cloud import CloudFrame, cloud_of_frame, match_groups
-from geomocap.image_files import read_image
+from geomocap.dense import CloudFrame, cloud_of_frame, match_groups
+from geomocap.files.images import read_image
 from geomocap.matching.lsm import match_pairs
-from geomocap.matching.settings import KernelSettings
+from geomocap.matching.matching_settings import KernelSettings
 from geomocap.matching.spline import SplineImage
+from geomocap.model.rig import Rig
 from tests.benchmarks.table import Row
 from tests.geomocap.speckle import Speckle, recorded
 from viz.matching_review import surface_errors

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import open3d as o3d
 
-from geomocap.tracking.node_settings import NodeTrackingSettings
-from geomocap.tracking.nodes import track_nodes
-from geomocap.tracking.surface_points import point_set
+from geomocap.nodes.node_settings import NodeTrackingSettings
+from geomocap.nodes.node_tracking import track_nodes
+from geomocap.nodes.surface_points import point_set
 from tests.benchmarks.table import Row, measure
 from tests.geomocap.star_scenes import star_points, star_truth
 
@@ -29,7 +29,7 @@ def benchmark() -> list[Row]:
     settings = NodeTrackingSettings()
     tracks = track_nodes(lambda t: frames[t], FRAMES, settings)
     error = star_truth(tracks, FRAMES)
-    share = 60 / FRAMES
+    fraction = 60 / FRAMES
     normals = measure(lambda: point_set(frames[0], POINTS, 9), 5)
     tracking = measure(lambda: track_nodes(lambda t: frames[t], FRAMES, settings), 2, warm_up=False)
     return [
@@ -40,8 +40,8 @@ def benchmark() -> list[Row]:
             measure(lambda: normals_with_open3d(frames[0]), 3),
         ),
         Row(
-            f"nodes through 60 frames ({FRAMES} timed × {share:.0f}), {settings.nodes:,} nodes, {POINTS:,} points",
-            tracking * share,
+            f"nodes through 60 frames ({FRAMES} timed × {fraction:.0f}), {settings.nodes:,} nodes, {POINTS:,} points",
+            tracking * fraction,
             goal="≤ 30 s",
             note=f"drift median {np.nanmedian(error) * 1000:.1f} mm, p95 {np.nanpercentile(error, 95) * 1000:.1f} mm",
         ),

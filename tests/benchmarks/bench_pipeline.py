@@ -29,7 +29,7 @@ def benchmark() -> list[Row]:
         _, few = _measure(short, root / "warm")  # compiles what is not compiled
         seconds, many = _measure(long, root / "run")
         stages = json.loads((root / "run" / "timings.json").read_text())
-    shares = ", ".join(f"{name} {stage['seconds']:.1f} s" for name, stage in stages.items())
+    fractions = ", ".join(f"{name} {stage['seconds']:.1f} s" for name, stage in stages.items())
     return [
         Row(
             f"{FRAMES} frames × {CAMERAS} cameras 320×240, PNG to skeleton and motion files, 256³, m3",
@@ -37,7 +37,7 @@ def benchmark() -> list[Row]:
             f"the recording itself ({FRAMES / 15:.1f} s)",
             FRAMES / 15,
             "≤ 30 s after compilation; flat memory",
-            f"{shares}; peak {many:.0f} MB, {few:.0f} MB with {FRAMES // 4} frames",
+            f"{fractions}; peak {many:.0f} MB, {few:.0f} MB with {FRAMES // 4} frames",
         ),
         Row(
             f"start of the command line ({sys.executable.rsplit('/', 1)[-1]} -m geomocap --help)",

@@ -13,12 +13,12 @@ from scipy.spatial import cKDTree
 
 from data_tools.asset import AnimatedAsset
 from data_tools.figure import figure, mechanism
-from geomocap.evaluation.bodies import adjusted_rand_index
-from geomocap.segmentation.motion_bodies import find_motion_bodies
-from geomocap.segmentation.motion_labels import label_points
+from geomocap.bodies.motion_bodies import find_motion_bodies
+from geomocap.bodies.point_labels import label_points
+from geomocap.evaluation.body_scores import adjusted_rand_index
+from geomocap.nodes.node_settings import NodeTrackingSettings
+from geomocap.nodes.node_tracking import NodeTracks, track_nodes
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
-from geomocap.tracking.node_settings import NodeTrackingSettings
-from geomocap.tracking.nodes import NodeTracks, track_nodes
 from tests.benchmarks.table import Row
 
 T = TypeVar("T")

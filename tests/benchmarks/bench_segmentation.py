@@ -7,17 +7,17 @@ from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from geomocap.segmentation.bodies import group_paths, path_integrals, similarity_threshold, unite
+from geomocap.model.ellipsoids import fit_ellipsoids
+from geomocap.model.rotations import body_rotations
+from geomocap.segmentation.axis_joints import grow_joints
 from geomocap.segmentation.contacts import count_contacts
-from geomocap.segmentation.ellipsoids import fit_ellipsoids
+from geomocap.segmentation.ellipsoid_matching import match_frames
+from geomocap.segmentation.ellipsoid_merging import merge_frame, merge_leaves
+from geomocap.segmentation.ellipsoid_splitting import split_frame
 from geomocap.segmentation.m3 import segment_m3
-from geomocap.segmentation.matching import match_frames
-from geomocap.segmentation.merging import merge_frame, merge_leaves
-from geomocap.segmentation.rotations import body_rotations
-from geomocap.segmentation.settings import SegmentationSettings
-from geomocap.segmentation.splitting import split_frame
-from geomocap.skeleton.joints import grow_joints
-from geomocap.skeleton.skeleton import skeleton_m3
+from geomocap.segmentation.m3_settings import SegmentationSettings
+from geomocap.segmentation.relative_paths import group_paths, path_integrals, similarity_threshold, unite
+from geomocap.skeleton.m3_skeleton import skeleton_m3
 from tests.benchmarks.table import Row, measure
 
 SPACING = 0.0113

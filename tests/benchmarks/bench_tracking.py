@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from geomocap.carving.views import PinholeViews
-from geomocap.tracking.frame_views import FrameViews
-from geomocap.tracking.patch_search import hiding_depth
-from geomocap.tracking.patch_tracking import track_surface
-from geomocap.tracking.patches import Patches, visible
-from geomocap.tracking.piece_search import free_places, motion_of_piece
-from geomocap.tracking.seeding import seed_patches, seed_spacing
-from geomocap.tracking.tracking_settings import TrackingSettings
+from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.patches.frame_views import FrameViews
+from geomocap.patches.patch_search import hiding_depth
+from geomocap.patches.patch_settings import TrackingSettings
+from geomocap.patches.patch_tracking import track_surface
+from geomocap.patches.piece_search import free_places, motion_of_piece
+from geomocap.patches.seeding import seed_patches, seed_spacing
+from geomocap.patches.surface_patches import Patches, visible
 from tests.benchmarks.table import Row, measure
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
 

@@ -6,9 +6,9 @@ import numpy as np
 import open3d as o3d
 
 from tests.benchmarks.table import Row, measure
-from viz.palette import body_colors
-from viz.render import Look, render
-from viz.views import stage_of
+from viz.body_colors import body_colors
+from viz.rendering import Look, render
+from viz.viewpoints import stage_of
 from viz.volumes import cubes, skin
 
 

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pycolmap
 
-from geomocap.cameras import Rig
-from geomocap.capture import Capture
-from geomocap.scan_files import Surface, places_on
+from geomocap.files.capture import Capture
+from geomocap.files.scan_geometry import ScanSurface, places_on
+from geomocap.model.rig import Rig
 
 LENSES = (
     ("PINHOLE", (640, 480), []),
@@ -85,9 +85,9 @@ def fresh_samples(truth: Path, scans: Path) -> None:
     np.savez(scans, points=np.stack([rng.permutation(places_on(s, 4096, seed=k).of(s.points)) for k, s in frames]))
 
 
-def _true_surfaces(truth: Path) -> list[Surface]:
+def _true_surfaces(truth: Path) -> list[ScanSurface]:
     with np.load(truth / "truth.npz") as loaded:
-        return [Surface(vertices.astype(float), loaded["faces"]) for vertices in loaded["vertices"]]
+        return [ScanSurface(vertices.astype(float), loaded["faces"]) for vertices in loaded["vertices"]]
 
 
 def different_cameras(capture: Path, truth: Path) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from data_tools.asset import AnimatedAsset
 from data_tools.figure import figure, mechanism
-from data_tools.gltf import load_gltf
+from data_tools.gltf_reader import load_gltf
 from data_tools.synthesize import SynthesisSettings, synthesize
 from tests.benchmarks.changes import crop, different_cameras, fresh_samples, give_silhouettes, perfect_tracks, reverse
 from tests.benchmarks.creatures import fan, runner, snake, spider

@@ -9,8 +9,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from geomocap.cameras import Rig
-from geomocap.capture import Capture
+from geomocap.files.capture import Capture
+from geomocap.model.rig import Rig
 from tests.cli.conftest import SETTINGS, last_line
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geomocap.export.trc import read_trc
-from geomocap.run import Run
+from geomocap.files.run import Run
 from tests.cli.conftest import last_line
 from tests.geomocap.articulated import skeleton_arrays
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from data_tools.calibration_files import read_calibration
-from geomocap.geometry import BodyPoints, Voxels
+from geomocap.model.frame_geometry import BodyPoints, Voxels
 from tests.cli.conftest import CAMERAS, FRAMES, SETTINGS
 
 CHANGING = {"timings.json", "run.toml"}

@@ -13,8 +13,8 @@ import pytest
 import tomli_w
 
 from data_tools import calibration_files as formats
-from geomocap.cameras import Rig
 from geomocap.errors import CalibrationError
+from geomocap.model.rig import Rig
 
 MODELS = {
     "PINHOLE": [800.25, 801.5, 641.123456789, 355.75],

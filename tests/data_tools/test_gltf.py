@@ -9,7 +9,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from data_tools.asset import WORLD_FROM_GLTF, AssetError
-from data_tools.gltf import animation_names, load_gltf
+from data_tools.gltf_reader import animation_names, load_gltf
 from tests.data_tools.gltf_writer import GltfWriter
 
 TURN = WORLD_FROM_GLTF[:3, :3]

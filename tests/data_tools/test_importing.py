@@ -8,12 +8,12 @@ import pycolmap
 import pytest
 
 from data_tools.calibration_files import write_pose2sim
+from data_tools.camera_views import look_at
 from data_tools.image_sizes import find_fit, has_black_bars, possible_fits, refit_camera
 from data_tools.importing import import_colmap, import_pose2sim
-from data_tools.video import VideoFile
-from data_tools.views import look_at
-from geomocap.cameras import Rig
+from data_tools.video_writing import VideoFile
 from geomocap.errors import CalibrationError, CaptureError
+from geomocap.model.rig import Rig
 
 CALIBRATED, PLAYED = (272, 480), (256, 480)
 

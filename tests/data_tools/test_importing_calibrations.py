@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from data_tools.importing_calibrations import WRITERS, convert_calibration, import_calibration
-from geomocap.capture import Capture
 from geomocap.errors import CalibrationError
+from geomocap.files.capture import Capture
 from tests.geomocap.test_cameras import make_rig
 
 

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from data_tools.bar import BarRecording, picture_bar
+from data_tools.camera_views import CameraView, look_at
 from data_tools.figure import figure
+from data_tools.image_rendering import PosedSubject, candidate_pixels, render_subject
 from data_tools.placement import make_camera
-from data_tools.render import PosedSubject, candidate_pixels, render_subject
 from data_tools.room import Light
-from data_tools.shading import Surface
+from data_tools.shading import ShadedSurface
 from data_tools.solid_noise import fabric_noise, gradient_noise
 from data_tools.synthesize import SynthesisResult, SynthesisSettings, make_world, synthesize
-from data_tools.views import View, look_at
-from geomocap.cameras import Rig
-from geomocap.capture import Capture
 from geomocap.errors import CaptureError
+from geomocap.files.capture import Capture
+from geomocap.model.rig import Rig
 from geomocap.scheduling import threads
 
 SMALL = SynthesisSettings(cameras=3, width=160, height=120, fps=10, frames=3, noise=0, shadow=False, exposure=0, bar=4)
@@ -47,7 +47,7 @@ def digest(folder: Path) -> dict[str, str]:
 def test_rays_of_a_pixel_are_centred_on_it() -> None:
     camera = make_camera(320, 240, 60, 2.0, np.random.default_rng(0))
     rig = Rig(("a",), (camera,), look_at(np.array([3.0, 1, 2]), np.zeros(3))[None])
-    view = View.of(rig, 0)
+    view = CameraView.of(rig, 0)
     pixels = np.array([0, 319, 120 * 320 + 160, 239 * 320])
     for samples in (1, 2, 4):
         rays = view.rays(pixels, samples).astype(np.float64)
@@ -63,10 +63,10 @@ def test_rays_of_a_pixel_are_centred_on_it() -> None:
 def test_candidate_pixels_hold_all_that_is_hit() -> None:
     vertices = figure().vertices(0.2)
     world = make_world(vertices[None], SMALL)
-    surface = Surface.of(figure(), world.footprint, 0.28, 0)
+    surface = ShadedSurface.of(figure(), world.footprint, 0.28, 0)
     subject = PosedSubject.of(surface, vertices)
     for c in range(len(world.rig)):
-        view = View.of(world.rig, c)
+        view = CameraView.of(world.rig, c)
         everything = np.arange(160 * 120)
         rays = view.rays(everything, 4).reshape(-1, 6)
         import open3d as o3d
@@ -115,7 +115,7 @@ def test_solid_noise_is_as_defined() -> None:
 
 def test_fabric_has_the_contrast_asked_for() -> None:
     asset = figure()
-    surface = Surface.of(asset, 0.004, 0.28, 0)
+    surface = ShadedSurface.of(asset, 0.004, 0.28, 0)
     points = np.random.default_rng(0).uniform(-1, 1, (4000, 3))
     values = [fabric_noise(*p, surface.cells, surface.weights, 0) for p in points]
     assert np.mean(values) == pytest.approx(0, abs=0.02)
@@ -223,7 +223,7 @@ def test_centroids_of_targets_are_their_centres(size: tuple[int, int], monkeypat
     dark = np.zeros((size[1], size[0], 3), np.float32)
     errors = []
     for c in range(len(world.rig)):
-        view = View.of(world.rig, c)
+        view = CameraView.of(world.rig, c)
         for pair in bar.targets:
             image = picture_bar(dark, view, world.rig, c, pair, bar.radius)[:, :, 0]
             both = world.rig.project(pair)[c]
@@ -329,7 +329,7 @@ def test_looping_is_said_and_occupied_folders_are_kept(tmp_path: Path, made) -> 
 
 @pytest.mark.parametrize(("name", "animation"), [("CesiumMan.glb", None), ("horse-animations.glb", "Walk")])
 def test_characters_become_captures(data: Path, tmp_path: Path, name: str, animation: str | None) -> None:
-    from data_tools.gltf import load_gltf
+    from data_tools.gltf_reader import load_gltf
 
     settings = SynthesisSettings(cameras=2, width=160, height=120, fps=15, frames=2)
     synthesize(load_gltf(data / "characters" / name, animation), tmp_path / "c", tmp_path / "t", settings)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from geomocap.cameras import Rig
+from geomocap.model.rig import Rig
 
 RADIUS = 0.45
 WIDTH, HEIGHT = 288, 224

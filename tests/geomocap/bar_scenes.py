@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from geomocap.calibration.datum import rigid_alignment
 from geomocap.calibration.network import Network, rotated
 from geomocap.calibration.projection import interior_of
-from geomocap.calibration.sightings import Sightings, stack_candidates
-from geomocap.cameras import Rig
+from geomocap.calibration.target_observations import TargetObservations, stack_candidates
+from geomocap.model.rig import Rig
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Scene:
     radius: float
 
     @property
-    def extent(self) -> float:
+    def diagonal(self) -> float:
         """Diagonal of the box around all bar ends, metres."""
         ends = self.bars.reshape(-1, 3)
         return float(np.linalg.norm(ends.max(axis=0) - ends.min(axis=0)))
@@ -148,7 +148,7 @@ def render(scene: Scene, frame: int, camera: int, rng: np.random.Generator, nois
         x0, y0 = int(pixel[0]) - reach, int(pixel[1]) - reach
         if np.isnan(pixel).any() or x0 < 0 or y0 < 0 or x0 + 2 * reach + 1 > w or y0 + 2 * reach + 1 > h:
             continue
-        # Share of each small square inside the outline, from its distance to it; then blur, then area means
+        # Fraction of each small square inside the outline, from its distance to it; then blur, then area means
         n, sub = 2 * reach + 1, 4
         g = (np.arange(n * sub) + 0.5) / sub
         grid = np.stack(np.meshgrid(x0 + g, y0 + g), axis=-1).reshape(-1, 2)
@@ -209,10 +209,10 @@ def disturbed_network(scene: Scene, noise: float, seed: int) -> Network:
 
 def seen(
     scene: Scene, rng: np.random.Generator, noise: float, false: float = 0.0, missing: np.ndarray | None = None
-) -> Sightings:
-    """Sightings of a scene, ends in random order.
+) -> TargetObservations:
+    """Observations of a scene, ends in random order.
 
-    false : share of images with a false blob; missing : share of detections missing in each camera
+    false : fraction of images with a false blob; missing : fraction of detections missing in each camera
     """
     pixels = scene.points(rng, noise)
     found = {}
@@ -228,8 +228,8 @@ def seen(
     return stack_candidates(scene.rig.names, scene.rig.sizes, np.arange(len(scene.bars)), found)
 
 
-def joined(first: Sightings, second: Sightings, frame: int) -> Sightings:
-    """The first sightings up to a frame, the second from it on."""
+def joined(first: TargetObservations, second: TargetObservations, frame: int) -> TargetObservations:
+    """The first observations up to a frame, the second from it on."""
     K = max(first.pixels.shape[2], second.pixels.shape[2])
 
     def both(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -237,7 +237,7 @@ def joined(first: Sightings, second: Sightings, frame: int) -> Sightings:
         wide = [np.pad(x, [(0, 0), (0, 0), (0, K - x.shape[2]), *rest], constant_values=np.nan) for x in (a, b)]
         return np.concatenate([wide[0][:, :frame], wide[1][:, frame:]], axis=1)
 
-    return Sightings(
+    return TargetObservations(
         first.cameras,
         first.sizes,
         first.frames,

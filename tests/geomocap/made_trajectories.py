@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geomocap.tracking.trajectories import Trajectories
+from geomocap.model.trajectories import Trajectories
 
 
 def rigid_tracks(

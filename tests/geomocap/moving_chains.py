@@ -56,20 +56,20 @@ def chain(bodies: int = 3, frames: int = 24, samples: int = 90, turn_deg: float 
 
 
 def seen_by_single_cameras(scene: Chain, depth_std: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Positions whose depths, each as one of four cameras around sees it, are off as a hull is; lines of sight."""
+    """Positions whose depths, each as one of four cameras around sees it, are off as a hull is; rays."""
     rng = np.random.default_rng(seed)
     count, frames = scene.positions.shape[:2]
     around = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
     camera = rng.integers(0, 4, count)
-    sight = np.repeat(around[camera][:, None], frames, axis=1)
+    ray = np.repeat(around[camera][:, None], frames, axis=1)
     hull = np.sin(0.9 * np.arange(frames) + 2.0 * camera[:, None] + 5.0 * scene.body[:, None])
     off = depth_std * (hull + 0.5 * rng.normal(size=(count, frames)))
     noise = rng.normal(scale=1e-3, size=scene.positions.shape)
-    return scene.positions + noise + off[:, :, None] * sight, sight
+    return scene.positions + noise + off[:, :, None] * ray, ray
 
 
 def same_partition(found: np.ndarray, true: np.ndarray) -> float:
-    """Share of samples whose body is the one that covers their true body best, one to one at best."""
+    """Fraction of samples whose body is the one that covers their true body best, one to one at best."""
     table = np.zeros((true.max() + 1, found.max() + 1))
     np.add.at(table, (true, found), 1)
     best = table.argmax(axis=1)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geomocap.carving.views import PinholeViews
-from geomocap.geometry import Voxels
-from geomocap.tracking.frame_views import FrameViews
+from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.model.frame_geometry import Voxels
+from geomocap.patches.frame_views import FrameViews
 
 RADII = np.array([0.20, 0.16, 0.25])
 VOXEL = 0.01

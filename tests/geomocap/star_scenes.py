@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from geomocap.tracking.nodes import NodeTracks
+from geomocap.nodes.node_tracking import NodeTracks
 
 LIMBS = np.array([[1.0, 0, 0.3], [-1, 0.2, 0.3], [0.4, 0, -1], [-0.4, 0, -1], [0, 0.1, 1]])
 LIMBS /= np.linalg.norm(LIMBS, axis=1, keepdims=True)
@@ -42,8 +42,8 @@ def pose(points: np.ndarray, limb: np.ndarray, phase: float) -> np.ndarray:
     middle = TRUNK + LENGTH / 2
     for k, a in enumerate(LIMBS):
         own = limb == k
-        share = np.clip((points[own] @ a - middle + 0.05) / 0.1, 0, 1)
-        angle = 0.9 * np.sin(2 * np.pi * phase + k) * share
+        fraction = np.clip((points[own] @ a - middle + 0.05) / 0.1, 0, 1)
+        angle = 0.9 * np.sin(2 * np.pi * phase + k) * fraction
         axis = np.cross(a, [0.1, 1.0, 0.2])
         R = Rotation.from_rotvec(angle[:, None] * axis / np.linalg.norm(axis)).as_matrix()
         out[own] = np.einsum("nij,nj->ni", R, points[own] - middle * a) + middle * a

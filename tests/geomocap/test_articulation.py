@@ -5,18 +5,18 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from geomocap.articulation.adjustment import JointPrior, _system, adjust
-from geomocap.articulation.kinematics import Linkage, body_motion, joint_motion, moved_by, posed, since
-from geomocap.articulation.normal_kernel import normal_equations
-from geomocap.articulation.observations import Observations, SkinPoints
-from geomocap.articulation.refinement import RefinementSettings, refine_motion, refine_skeleton
-from geomocap.articulation.skinning import candidates_near, fit_shares
-from geomocap.articulation.smoothness import Smoothness, accelerations
-from geomocap.segmentation.motion_bodies import MotionBodiesSettings, find_motion_bodies
-from geomocap.segmentation.motion_paths import MotionPaths
-from geomocap.segmentation.rigid_motions import turn_angles
-from geomocap.skeleton.hierarchy import Hierarchy
+from geomocap.bodies.motion_bodies import MotionBodiesSettings, find_motion_bodies
+from geomocap.bodies.rigid_motions import turn_angles
+from geomocap.model.hierarchy import Hierarchy
+from geomocap.model.motion_paths import MotionPaths
+from geomocap.skeleton.adjustment_kernel import normal_equations
+from geomocap.skeleton.articulated_adjustment import JointPrior, _system, adjust
+from geomocap.skeleton.body_observations import Observations, SkinPoints
+from geomocap.skeleton.kinematics import Linkage, body_motion, joint_motion, moved_by, posed, since
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
+from geomocap.skeleton.motion_smoothness import Smoothness, accelerations
+from geomocap.skeleton.refinement import RefinementSettings, refine_motion, refine_skeleton
+from geomocap.skeleton.skinning import candidates_near, fit_fractions
 from tests.geomocap.moving_chains import Chain, chain, seen_by_single_cameras
 
 
@@ -51,7 +51,7 @@ def test_forward_kinematics_are_those_of_the_chain(hinges):
     bodies = body_motion(linkage, motion)
     np.testing.assert_allclose(bodies.rotations, scene.rotations, atol=1e-12)
     np.testing.assert_allclose(bodies.translations, scene.translations, atol=1e-12)
-    carried = bodies.carry(points.rest, points.bodies, points.shares)
+    carried = bodies.carry(points.rest, points.bodies, points.fractions)
     np.testing.assert_allclose(carried.swapaxes(0, 1), scene.positions, atol=1e-12)
 
 
@@ -87,7 +87,7 @@ def test_kernel_agrees_with_the_sums_written_out():
         np.concatenate([[0], np.cumsum([len(c) for c in chains])]),
         skin.rest,
         skin.bodies,
-        skin.shares,
+        skin.fractions,
         start,
         point,
         target,
@@ -103,11 +103,11 @@ def test_kernel_agrees_with_the_sums_written_out():
         expected, side, total = np.zeros((unknowns, unknowns)), np.zeros(unknowns), 0.0
         for m in range(start[t], start[t + 1]):
             place, jacobian = np.zeros(3), np.zeros((3, unknowns))
-            for b, share in zip(skin.bodies[point[m]], skin.shares[point[m]], strict=True):
+            for b, fraction in zip(skin.bodies[point[m]], skin.fractions[point[m]], strict=True):
                 x = rotations[t, b] @ skin.rest[point[m]] + translations[t, b]
-                place += share * x
+                place += fraction * x
                 for u in chains[b]:
-                    jacobian[:, u] += share * (np.cross(twists[t, u, :3], x) + twists[t, u, 3:])
+                    jacobian[:, u] += fraction * (np.cross(twists[t, u, :3], x) + twists[t, u, 3:])
             miss = target[m] - place
             weight = isotropic[m] * np.eye(3) + across[m] * np.outer(normal[m], normal[m])
             chi2 = miss @ weight @ miss
@@ -124,12 +124,12 @@ def test_poses_and_joints_are_recovered():
     scene = chain(4)
     linkage, motion, points = linked(scene)
     shifted = replace(linkage, joints=linkage.joints + np.random.default_rng(2).normal(0, 0.02, (3, 3)))
-    sightings = Observations.of_paths(scene.positions, np.full(scene.positions.shape[:2], 0.002))
+    observations = Observations.of_paths(scene.positions, np.full(scene.positions.shape[:2], 0.002))
     found = adjust(
         shifted,
         disturbed(linkage, motion, 0.1),
         points,
-        sightings,
+        observations,
         smoothness=prior(linkage, 1.0, 1.0),
         joint_prior=JointPrior(shifted.joints, 1.0),
         rounds=30,
@@ -147,8 +147,8 @@ def test_frames_without_sightings_are_bridged():
     seen[:, 20:26] = np.nan
     start = joint_motion(linkage, scene.rotations.copy(), motion.root.copy())
     start.local[20:26], start.root[20:26] = start.local[19], start.root[19]
-    sightings = Observations.of_paths(seen, np.full(seen.shape[:2], 0.002))
-    found = adjust(linkage, start, points, sightings, smoothness=prior(linkage, 0.02, 0.005), rounds=30)
+    observations = Observations.of_paths(seen, np.full(seen.shape[:2], 0.002))
+    found = adjust(linkage, start, points, observations, smoothness=prior(linkage, 0.02, 0.005), rounds=30)
     held = turn_errors_deg(body_motion(linkage, start).rotations, scene.rotations)[20:26].max()
     assert held > 10.0
     assert turn_errors_deg(found.bodies.rotations, scene.rotations)[20:26].max() < 1.0
@@ -161,11 +161,11 @@ def test_noise_goes_and_a_kick_stays_without_lag():
     local = motion.local.copy()
     local[:, 1] = Rotation.from_rotvec(angle[:, None] * [0.0, 0.0, 1.0]).as_matrix()
     true = replace(motion, local=local)
-    positions = body_motion(linkage, true).carry(points.rest, points.bodies, points.shares).swapaxes(0, 1)
+    positions = body_motion(linkage, true).carry(points.rest, points.bodies, points.fractions).swapaxes(0, 1)
     noisy = disturbed(linkage, true, np.deg2rad(0.5), seed=3)
-    shaken = body_motion(linkage, noisy).carry(points.rest, points.bodies, points.shares).swapaxes(0, 1)
-    sightings = Observations.of_paths(shaken, np.full(positions.shape[:2], 0.05))
-    found = adjust(linkage, noisy, points, sightings, smoothness=prior(linkage, 0.005, 0.001), rounds=30)
+    shaken = body_motion(linkage, noisy).carry(points.rest, points.bodies, points.fractions).swapaxes(0, 1)
+    observations = Observations.of_paths(shaken, np.full(positions.shape[:2], 0.05))
+    found = adjust(linkage, noisy, points, observations, smoothness=prior(linkage, 0.005, 0.001), rounds=30)
     turned = Rotation.from_matrix(found.motion.local[:, 1]).as_rotvec()[:, 2]
     shaking = np.abs(accelerations(linkage, noisy)[:18]).mean()
     assert np.abs(accelerations(linkage, found.motion)[:18]).mean() < 0.5 * shaking
@@ -176,15 +176,15 @@ def test_hinge_turns_about_its_axis_only():
     scene = chain(3)
     linkage, motion, points = linked(scene, hinges=True)
     shaken = scene.positions + np.random.default_rng(4).normal(0, 0.01, scene.positions.shape)
-    sightings = Observations.of_paths(shaken, np.full(shaken.shape[:2], 0.01))
-    found = adjust(linkage, motion, points, sightings, rounds=20)
+    observations = Observations.of_paths(shaken, np.full(shaken.shape[:2], 0.01))
+    found = adjust(linkage, motion, points, observations, rounds=20)
     for j in range(2):
         vectors = Rotation.from_matrix(found.motion.local[:, j + 1]).as_rotvec()
         np.testing.assert_allclose(np.cross(vectors, linkage.axes[j]), 0.0, atol=1e-9)
     assert turn_errors_deg(found.bodies.rotations, scene.rotations).max() < 2.0
 
 
-def test_shares_of_soft_skin_are_found():
+def test_fractions_of_soft_skin_are_found():
     scene = chain(3, samples=40)
     linkage, motion, points = linked(scene)
     bodies = body_motion(linkage, motion)
@@ -192,13 +192,13 @@ def test_shares_of_soft_skin_are_found():
     weights = np.zeros((len(points), 3))
     weights[:, :2] = rng.dirichlet([1.0, 1.0], len(points))
     true = SkinPoints.of_weights(points.rest, weights)
-    seen = bodies.carry(true.rest, true.bodies, true.shares).swapaxes(0, 1)
+    seen = bodies.carry(true.rest, true.bodies, true.fractions).swapaxes(0, 1)
     near = np.tile(np.array([0, 1, 2, -1], np.int32), (len(points), 1))
-    found = fit_shares(points, bodies, seen, np.ones(seen.shape[:2]), near, np.full(len(points), 1e-12))
-    np.testing.assert_allclose(found.weights(3), true.weights(3), atol=0.011)  # shares below 0.01 are dropped
+    found = fit_fractions(points, bodies, seen, np.ones(seen.shape[:2]), near, np.full(len(points), 1e-12))
+    np.testing.assert_allclose(found.weights(3), true.weights(3), atol=0.011)  # fractions below 0.01 are dropped
 
 
-def test_shares_are_the_least_squares_ones():
+def test_fractions_are_the_least_squares_ones():
     scene = chain(3, samples=30)
     linkage, motion, points = linked(scene)
     bodies = body_motion(linkage, motion)
@@ -207,7 +207,7 @@ def test_shares_are_the_least_squares_ones():
     weights = rng.random(seen.shape[:2])
     near = candidates_near(linkage, points)
     pull = np.full(len(points), 1e-3)
-    found = fit_shares(points, bodies, seen, weights, near, pull).weights(3)
+    found = fit_fractions(points, bodies, seen, weights, near, pull).weights(3)
     for n in (0, 40, 80):
         carried = np.einsum("tbij,j->tbi", bodies.rotations, points.rest[n]) + bodies.translations
         present = points.weights(3)[n]
@@ -225,17 +225,17 @@ def test_shares_are_the_least_squares_ones():
 def test_right_sides_are_the_slopes_of_the_cost():
     linkage, motion, points = linked(chain(4))
     linkage = replace(linkage, hinge=np.array([True, False, True]))
-    sightings = Observations.of_paths(chain(4).positions, np.full((len(points), motion.frames), 0.01))
+    observations = Observations.of_paths(chain(4).positions, np.full((len(points), motion.frames), 0.01))
     loose = np.array([0.01, 0.02, 0.03])
     rng, size = np.random.default_rng(0), int(linkage.joint_dof[-1])
     away = replace(motion, slip=rng.normal(0, 0.05, (motion.frames, 3, 3)))
     away = moved_by(linkage, away, rng.normal(0, 0.05, (motion.frames, size + 9)))
     priors = (None, None, JointPrior(linkage.joints + 0.01, 0.1), loose)
-    system = _system(linkage, away, points, sightings, priors, 3.0)
+    system = _system(linkage, away, points, observations, priors, 3.0)
 
     def cost(step, shift):
         bent = replace(linkage, joints=linkage.joints + shift)
-        return _system(bent, moved_by(linkage, away, step), points, sightings, priors, 3.0).cost
+        return _system(bent, moved_by(linkage, away, step), points, observations, priors, 3.0).cost
 
     for t, k in ((0, 0), (5, 4), (7, 6), (8, 8), (3, size), (4, size + 5), (23, size + 8)):
         step = np.zeros((motion.frames, size + 9))
@@ -271,13 +271,13 @@ def test_joint_that_is_none_does_not_bend_the_motion():
     assert turn_errors_deg(loose.bodies.rotations, true).mean() < 0.1
 
 
-def test_refinement_hardly_heeds_what_is_unsure_along_the_line_of_sight():
+def test_refinement_hardly_heeds_what_is_unsure_along_the_ray():
     scene = chain(3)
     linkage, motion, points = linked(scene)
-    positions, sight = seen_by_single_cameras(scene, 0.02)
+    positions, ray = seen_by_single_cameras(scene, 0.02)
     errors = [
         turn_errors_deg(refine_motion(linkage, motion, points, paths, 1.3).bodies.rotations, scene.rotations).mean()
-        for paths in (MotionPaths(positions), MotionPaths(positions, sight=sight))
+        for paths in (MotionPaths(positions), MotionPaths(positions, ray=ray))
     ]
     assert errors[1] < 0.4 * errors[0]
 
@@ -322,7 +322,7 @@ def test_perfect_paths_are_not_made_worse_and_results_repeat():
     assert turn_errors_deg(found.bodies.rotations, scene.rotations).max() < 0.05
     again = refine_motion(linkage, motion, points, paths, 1.3)
     np.testing.assert_array_equal(found.bodies.rotations, again.bodies.rotations)
-    np.testing.assert_array_equal(found.points.shares, again.points.shares)
+    np.testing.assert_array_equal(found.points.fractions, again.points.fractions)
 
 
 def test_no_rounds_mean_no_change():

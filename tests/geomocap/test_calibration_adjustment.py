@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geomocap.calibration.adjustment import (
+from geomocap.calibration.bundle_adjustment import (
     OPENCV,
     Columns,
     Groups,

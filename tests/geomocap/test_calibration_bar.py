@@ -12,13 +12,13 @@ import pycolmap
 import pytest
 import tomli_w
 
-from geomocap.calibration.calibrate import Calibration, calibrate_bar
+from geomocap.calibration.bar_calibration import Calibration, calibrate_bar
+from geomocap.calibration.calibration_settings import BarSettings, TargetSettings
 from geomocap.calibration.from_capture import calibrate_capture
 from geomocap.calibration.initial import pair_all
 from geomocap.calibration.recording import Recording, measure
-from geomocap.calibration.settings import BarSettings, TargetSettings
-from geomocap.cameras import Rig
 from geomocap.errors import CalibrationError, CaptureError
+from geomocap.model.rig import Rig
 from tests.geomocap.bar_scenes import (
     Scene,
     eight_cameras,
@@ -120,8 +120,8 @@ def test_a_knocked_camera_is_named(make: Callable[[int], Scene], angle: float, s
     camera = 2
     after = knocked(scene, camera, angle, shift)
     rng = np.random.default_rng(5)
-    sightings = joined(seen(scene, rng, NOISE, 0.03), seen(after, rng, NOISE, 0.03), 30)
-    calibration = calibrate_bar(sightings, scene.length, FLAT, length_sigma=1e-5)
+    observations = joined(seen(scene, rng, NOISE, 0.03), seen(after, rng, NOISE, 0.03), 30)
+    calibration = calibrate_bar(observations, scene.length, FLAT, length_sigma=1e-5)
     (moved,) = calibration.moved
     assert moved.camera == scene.rig.names[camera]
     assert 27 <= moved.before < moved.after <= 32
@@ -136,10 +136,10 @@ def test_a_knocked_camera_is_named(make: Callable[[int], Scene], angle: float, s
 
 def test_swapped_ends_are_told_apart_by_geometry() -> None:
     scene = three_cameras(3)
-    sightings = seen(scene, np.random.default_rng(0), 0.0)
-    pairings = pair_all(sightings, BarSettings())
+    observations = seen(scene, np.random.default_rng(0), 0.0)
+    pairings = pair_all(observations, BarSettings())
     truth = scene.rig.project(scene.bars.reshape(-1, 3)).reshape(3, -1, 2, 2)
-    first = np.linalg.norm(sightings.pixels[:, :, :1] - truth, axis=-1).argmin(axis=2)
+    first = np.linalg.norm(observations.pixels[:, :, :1] - truth, axis=-1).argmin(axis=2)
     assert len(pairings) == 3
     for (i, j), pairing in pairings.items():
         np.testing.assert_array_equal(pairing.swapped, (first[i] != first[j])[pairing.frames])
@@ -169,27 +169,27 @@ def test_degenerate_motion_is_named() -> None:
 def words_of(scene: Scene) -> str:
     """Warnings or the error's words of a calibration."""
     try:
-        sightings = seen(scene, np.random.default_rng(1), NOISE)
-        return " ".join(calibrate_bar(sightings, scene.length, FLAT).verdict.warnings)
+        observations = seen(scene, np.random.default_rng(1), NOISE)
+        return " ".join(calibrate_bar(observations, scene.length, FLAT).verdict.warnings)
     except CalibrationError as error:
         return str(error)
 
 
 def test_cameras_without_common_bars_are_named() -> None:
     scene = three_cameras(3)
-    sightings = seen(scene, np.random.default_rng(0), NOISE)
-    sightings.pixels[2, :55] = np.nan
+    observations = seen(scene, np.random.default_rng(0), NOISE)
+    observations.pixels[2, :55] = np.nan
     with pytest.raises(CalibrationError, match="camera c"):
-        calibrate_bar(sightings, scene.length, FLAT)
-    sightings.pixels[1:] = np.nan
+        calibrate_bar(observations, scene.length, FLAT)
+    observations.pixels[1:] = np.nan
     with pytest.raises(CalibrationError, match="no two cameras"):
-        calibrate_bar(sightings, scene.length, FLAT)
+        calibrate_bar(observations, scene.length, FLAT)
 
 
 def test_given_interior_orientations_are_kept() -> None:
     scene = three_cameras(3)
-    sightings = seen(scene, np.random.default_rng(0), NOISE)
-    calibration = calibrate_bar(sightings, scene.length, FLAT, given=scene.rig, length_sigma=1e-5)
+    observations = seen(scene, np.random.default_rng(0), NOISE)
+    calibration = calibrate_bar(observations, scene.length, FLAT, given=scene.rig, length_sigma=1e-5)
     for one, other in zip(calibration.rig.cameras, scene.rig.cameras, strict=True):
         np.testing.assert_allclose(one.params, other.params)
     check(scene, calibration)
@@ -223,13 +223,13 @@ def test_a_stronger_lens_model_only_where_it_is_needed() -> None:
     rig = Rig(scene.rig.names, tuple(cameras), np.array(scene.rig.cam_from_world))
     half, target = np.array([1.1, 0.9, 0.8]), np.array([0, 0, 1.0])
     wide = replace(scene, rig=rig, bars=random_bars(np.random.default_rng(1), rig, 60, 0.5, half, target, 3))
-    sightings = seen(wide, np.random.default_rng(0), NOISE)
-    calibration = calibrate_bar(sightings, wide.length, FLAT, length_sigma=1e-5)
+    observations = seen(wide, np.random.default_rng(0), NOISE)
+    calibration = calibrate_bar(observations, wide.length, FLAT, length_sigma=1e-5)
     assert all(c.model.name == "FULL_OPENCV" for c in calibration.rig.cameras)
     np.testing.assert_allclose([c.params[8] for c in calibration.rig.cameras], -0.06, atol=0.03)
     check(wide, calibration)
     plain = FLAT.model_copy(update={"model": "OPENCV"})
-    fixed = calibrate_bar(sightings, wide.length, plain, length_sigma=1e-5)
+    fixed = calibrate_bar(observations, wide.length, plain, length_sigma=1e-5)
     assert fixed.sigma0 > calibration.sigma0
     assert any(t.significant for t in fixed.tests if t.parameter == "k3")
 
@@ -243,7 +243,7 @@ def test_videos_are_read_frame_by_frame(tmp_path: Path) -> None:
             writer.write(render(scene, t, c, np.random.default_rng(t), 0.0)[..., ::-1])
         writer.release()
     recording = Recording.open(tmp_path / "bar", length=scene.length)
-    sightings = measure(recording, TargetSettings(background_frames=5))
+    observations = measure(recording, TargetSettings(background_frames=5))
     truth = scene.rig.project(scene.bars.reshape(-1, 3)).reshape(3, 5, 2, 2)
-    near = np.linalg.norm(sightings.pixels[:, :, :, None] - truth[:, :, None], axis=-1).min(axis=2)
+    near = np.linalg.norm(observations.pixels[:, :, :, None] - truth[:, :, None], axis=-1).min(axis=2)
     assert (near[scene.visible()] < 0.3).mean() > 0.9

@@ -9,9 +9,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from geomocap.cameras import Rig
-from geomocap.cli.calibrate import calibrate
+from geomocap.cli.calibrate_command import calibrate
 from geomocap.errors import GeomocapError
+from geomocap.model.rig import Rig
 from tests.geomocap.bar_scenes import three_cameras
 
 app = typer.Typer()

@@ -11,10 +11,10 @@ import pytest
 from geomocap.calibration import datum as d
 from geomocap.calibration.from_capture import with_points
 from geomocap.calibration.network import Network, rotated
-from geomocap.calibration.observations import read_observed
-from geomocap.calibration.world import World
-from geomocap.cameras import Rig
+from geomocap.calibration.observed_points import read_observed
+from geomocap.calibration.world import WorldKnowledge
 from geomocap.errors import CalibrationError
+from geomocap.model.rig import Rig
 from tests.geomocap.bar_scenes import eight_cameras, true_network
 
 SCENE = eight_cameras(6, 20)
@@ -88,7 +88,7 @@ def test_points_from_tables(tmp_path: Path) -> None:
         for camera, (x, y) in zip(SCENE.rig.names, project(X[None])[:, 0], strict=True):
             lines.append(f"0,{camera},{name},{x},{y}")
     (tmp_path / "seen.csv").write_text("\n".join(lines))
-    filled = with_points(World(), read_observed(tmp_path / "seen.csv"), world, SCENE.rig.names)
+    filled = with_points(WorldKnowledge(), read_observed(tmp_path / "seen.csv"), world, SCENE.rig.names)
     assert filled.points_pixels is not None and filled.points_world is not None
     assert_world(d.datum_from_points(LOST, filled.points_pixels, filled.points_world).apply(LOST))
 

@@ -7,13 +7,13 @@ from itertools import product
 import numpy as np
 from scipy.optimize import least_squares
 
+from geomocap.calibration.calibration_settings import BarSettings
 from geomocap.calibration.disc import blurred_disc, fit_disc
 from geomocap.calibration.eccentricity import shifts
 from geomocap.calibration.labelling import identify_frame
 from geomocap.calibration.orientation import ideal_coordinates, relative_orientation, triangulate
 from geomocap.calibration.pairs import eight_point, score_pairings
 from geomocap.calibration.projection import interior_of
-from geomocap.calibration.settings import BarSettings
 from geomocap.calibration.stability import resect
 from tests.geomocap.bar_scenes import eight_cameras, seen, three_cameras, true_network
 
@@ -89,11 +89,11 @@ def labels_by_brute_force(pixels: np.ndarray, limit: float) -> np.ndarray:
 
 def test_labels_are_those_of_brute_force() -> None:
     rng = np.random.default_rng(2)
-    sightings = seen(SCENE, rng, 0.3, 0.8, np.array([0.0, 0.3, 0.1]))
+    observations = seen(SCENE, rng, 0.3, 0.8, np.array([0.0, 0.3, 0.1]))
     pose = SCENE.rig.cam_from_world
     compared = 0
     for t in range(12):
-        pixels = np.ascontiguousarray(sightings.pixels[:, t])
+        pixels = np.ascontiguousarray(observations.pixels[:, t])
         ideal = ideal_coordinates(pixels, INTERIOR, SCENE.rig.sizes)
         chosen = np.empty((3, 2), dtype=np.int64)
         R, shift = np.ascontiguousarray(pose[:, :, :3]), np.ascontiguousarray(pose[:, :, 3])
@@ -111,16 +111,16 @@ def test_labels_are_those_of_brute_force() -> None:
 def test_resection_without_knowing_the_ends() -> None:
     scene = eight_cameras(2, 30)
     network = true_network(scene, 0.1, 0)
-    sightings = seen(scene, np.random.default_rng(3), 0.1)
-    pose = resect(network, sightings, 4, np.arange(30), 2.0, np.random.default_rng(0))
+    observations = seen(scene, np.random.default_rng(3), 0.1)
+    pose = resect(network, observations, 4, np.arange(30), 2.0, np.random.default_rng(0))
     assert pose is not None
     np.testing.assert_allclose(pose, scene.rig.cam_from_world[4], atol=0.02)
-    elsewhere = sightings.pixels.copy()
+    elsewhere = observations.pixels.copy()
     elsewhere[4] = np.random.default_rng(5).uniform(0, 200, elsewhere[4].shape)
     assert (
         resect(
             network,
-            type(sightings)(*{**vars(sightings), "pixels": elsewhere}.values()),
+            type(observations)(*{**vars(observations), "pixels": elsewhere}.values()),
             4,
             np.arange(30),
             2.0,

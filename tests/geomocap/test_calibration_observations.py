@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from data_tools.calibration_files import read_calibration
-from geomocap.calibration.calibrate import calibrate_bar
-from geomocap.calibration.observations import Observed, read_observed, sightings_of
+from geomocap.calibration.bar_calibration import calibrate_bar
+from geomocap.calibration.observed_points import Observed, observations_of, read_observed
 from geomocap.calibration.orientation import triangulate
-from geomocap.calibration.world import World
-from geomocap.cameras import Rig
+from geomocap.calibration.world import WorldKnowledge
 from geomocap.errors import CalibrationError
+from geomocap.model.rig import Rig
 from tests.geomocap.bar_scenes import three_cameras
 
 SIZES = dict.fromkeys("abc", (640, 480))
@@ -34,11 +34,11 @@ def table_of_scene(path: Path) -> np.ndarray:
 
 def test_our_table(tmp_path: Path) -> None:
     pixels = table_of_scene(tmp_path / "points.csv")
-    sightings = sightings_of(read_observed(tmp_path / "points.csv"), sizes=SIZES)
-    np.testing.assert_array_equal(sightings.frames, np.arange(100, 120))
-    np.testing.assert_allclose(sightings.pixels, pixels)
-    assert set(np.unique(sightings.sigmas[np.isfinite(sightings.sigmas)])) == {0.05}
-    np.testing.assert_array_equal(sightings_of(read_observed(tmp_path / "points.csv")).sizes, [[640, 480]] * 3)
+    observations = observations_of(read_observed(tmp_path / "points.csv"), sizes=SIZES)
+    np.testing.assert_array_equal(observations.frames, np.arange(100, 120))
+    np.testing.assert_allclose(observations.pixels, pixels)
+    assert set(np.unique(observations.sigmas[np.isfinite(observations.sigmas)])) == {0.05}
+    np.testing.assert_array_equal(observations_of(read_observed(tmp_path / "points.csv")).sizes, [[640, 480]] * 3)
 
 
 def test_tables_that_cannot_be_used(tmp_path: Path) -> None:
@@ -58,11 +58,11 @@ def test_tables_that_cannot_be_used(tmp_path: Path) -> None:
     table_of_scene(file)
     observed = read_observed(file)
     with pytest.raises(CalibrationError, match="no point nose"):
-        sightings_of(observed, [("left", "nose")])
+        observations_of(observed, [("left", "nose")])
     with pytest.raises(CalibrationError, match="outside its image of 320×240"):
-        sightings_of(observed, sizes=dict.fromkeys("abc", (320, 240)))
+        observations_of(observed, sizes=dict.fromkeys("abc", (320, 240)))
     with pytest.raises(CalibrationError, match="camera d"):
-        sightings_of(observed, cameras=("a", "d"))
+        observations_of(observed, cameras=("a", "d"))
 
 
 def corners(observed: Observed, rig: Rig) -> dict[tuple[int, str], np.ndarray]:
@@ -103,9 +103,9 @@ def test_real_board_from_two_far_corners(data: Path) -> None:
     assert length == pytest.approx(0.1947, abs=1e-5)
     supplied = read_calibration(folder / "config.toml")
     sizes = {n: (1280, 720) for n in supplied.names}
-    sightings = sightings_of(observed, diagonals, sizes)
+    observations = observations_of(observed, diagonals, sizes)
 
-    ours = calibrate_bar(sightings, length, world=World(rig=supplied), length_sigma=1e-4)
+    ours = calibrate_bar(observations, length, world=WorldKnowledge(rig=supplied), length_sigma=1e-4)
     without = {name for pair in diagonals for name in pair}
     mine, theirs = (edge_errors(observed, rig, board, without) for rig in (ours.rig, supplied))
     assert len(mine) == len(theirs) > 450
@@ -115,7 +115,7 @@ def test_real_board_from_two_far_corners(data: Path) -> None:
     centers, angles = differences(ours.rig, supplied)
     assert centers.max() < 0.05 and angles.max() < 6
 
-    kept = calibrate_bar(sightings, length, world=World(rig=supplied), given=supplied, length_sigma=1e-4)
+    kept = calibrate_bar(observations, length, world=WorldKnowledge(rig=supplied), given=supplied, length_sigma=1e-4)
     mine = edge_errors(observed, kept.rig, board, without)
     assert np.sqrt(np.mean(mine**2)) < np.sqrt(np.mean(theirs**2))
     centers, angles = differences(kept.rig, supplied)

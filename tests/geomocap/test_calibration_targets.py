@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from geomocap.calibration.calibration_settings import TargetSettings
 from geomocap.calibration.disc import blurred_disc, fit_disc
-from geomocap.calibration.settings import TargetSettings
 from geomocap.calibration.targets import find_targets, gray_of, still_background
 from tests.geomocap.bar_scenes import eight_cameras, render, three_cameras
 

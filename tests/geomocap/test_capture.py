@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from geomocap.capture import Capture, CaptureInfo, write_capture_info
 from geomocap.errors import CaptureError
-from geomocap.video_files import Video
+from geomocap.files.capture import Capture, CaptureInfo, write_capture_info
+from geomocap.files.videos import Video
 from tests.geomocap.test_cameras import make_rig
 
 

@@ -6,15 +6,15 @@ import numpy as np
 import open3d as o3d
 import pytest
 
+from geomocap.carving.carving_settings import CarvingSettings, ConsistencySettings
 from geomocap.carving.coloring import GREY, voxel_colors
 from geomocap.carving.consistency import camera_gains, carve_inconsistent, color_deviation
 from geomocap.carving.frames import carve_frame, needs_images
-from geomocap.carving.grid import Grid
 from geomocap.carving.hull import hull
 from geomocap.carving.occupancy import Occupancy
-from geomocap.carving.settings import CarvingSettings, ConsistencySettings
-from geomocap.carving.views import PinholeViews
-from geomocap.carving.visibility import Sightings, SurfaceVoxels, depth_buffers, normals, sightings
+from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.carving.visibility import SurfaceVoxels, VoxelVisibility, depth_buffers, normals, observations
+from geomocap.carving.voxel_grid import Grid
 from tests.geomocap.carving_scenes import look_at, ring
 
 WIDTH, HEIGHT = 240, 180
@@ -125,7 +125,7 @@ def test_brightness_of_the_cameras_makes_no_difference(solid):
     factor = np.random.default_rng(0).uniform(0.75, 1.0, size=(len(views), 1, 1, 3))
     dimmed = (images * factor).astype(np.uint8)
     surface = SurfaceVoxels.of(hull(views, GRID))
-    seen = sightings(views, dimmed, GRID, surface, depth_buffers(views, GRID, surface))
+    seen = observations(views, dimmed, GRID, surface, depth_buffers(views, GRID, surface))
     gains = camera_gains(seen)
     product = gains * factor[:, 0, 0]
     np.testing.assert_allclose(product / np.median(product, axis=0), 1, atol=0.1)
@@ -147,7 +147,7 @@ def test_visibility_is_that_of_ray_casting():
     P = cameras(4)
     views, images = photograph(scene, P)
     voxels = SurfaceVoxels.of(occupancy)
-    seen = sightings(views, images, GRID, voxels, depth_buffers(views, GRID, voxels)).seen
+    seen = observations(views, images, GRID, voxels, depth_buffers(views, GRID, voxels)).seen
     n = normals(occupancy, surface)
     agree = total = 0
     for c, camera in enumerate(P):
@@ -201,7 +201,7 @@ def test_deviation_is_the_spread_about_the_median():
             middle = np.median(colors[n, c] * gains[c], axis=0)
             off = np.maximum(np.maximum(low[n, c] * gains[c] - middle, middle - high[n, c] * gains[c]), 0)
             expected[n] = np.sqrt((off**2).mean())
-    got = color_deviation(Sightings(seen, colors, low, high), gains, 3)
+    got = color_deviation(VoxelVisibility(seen, colors, low, high), gains, 3)
     np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-3)
 
 
@@ -241,7 +241,7 @@ def test_what_nobody_sees_takes_its_neighbour_s_colour():
     grid = Grid.of_box([-0.6, -0.6, -0.1], [0.6, 0.6, 0.6], resolution=60)
     occupancy = hull(views, grid)
     voxels = SurfaceVoxels.of(occupancy)
-    seen = sightings(views, images, grid, voxels, depth_buffers(views, grid, voxels)).seen.any(axis=1)
+    seen = observations(views, images, grid, voxels, depth_buffers(views, grid, voxels)).seen.any(axis=1)
     colors = voxel_colors(views, images, grid, occupancy)
     assert 0.2 < seen.mean() < 0.9
     known = {tuple(c) for c in colors[seen]}

@@ -8,9 +8,9 @@ import open3d as o3d
 import pycolmap
 import pytest
 
-from geomocap.cameras import Rig
 from geomocap.carving.holes import enclosed_holes, fill_false_holes
-from geomocap.carving.views import undistort_masks
+from geomocap.carving.silhouette_views import undistort_masks
+from geomocap.model.rig import Rig
 
 SIZE = 120
 

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from scipy.ndimage import binary_erosion
 
 from geomocap.carving.block_kernels import summed
-from geomocap.carving.grid import Grid
+from geomocap.carving.carving_settings import HullSettings
 from geomocap.carving.hull import hull_surface, visual_hull
 from geomocap.carving.occupancy import Occupancy
 from geomocap.carving.reference import visual_hull_brute, visual_hull_numpy
-from geomocap.carving.settings import HullSettings
-from geomocap.carving.views import PinholeViews
+from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.carving.voxel_grid import Grid
 from geomocap.errors import GeometryError
 from tests.geomocap.carving_scenes import FIGURE, look_at, ring, silhouettes
 

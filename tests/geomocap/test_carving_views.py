@@ -6,9 +6,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from geomocap.cameras import Rig
-from geomocap.carving.views import PinholeViews, Undistortion, pad, undistort_masks
+from geomocap.carving.silhouette_views import PinholeViews, Undistortion, pad, undistort_masks
 from geomocap.errors import CalibrationError
+from geomocap.model.rig import Rig
 
 
 def rig(*params: tuple[int, int, list[float]]) -> Rig:

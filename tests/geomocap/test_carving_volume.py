@@ -14,13 +14,13 @@ from geomocap.carving.agreement import (
     check_silhouettes,
     silhouette_coverage,
 )
-from geomocap.carving.bounds import subject_box
+from geomocap.carving.carving_settings import CarvingSettings, HullSettings
 from geomocap.carving.frames import carve_frame
-from geomocap.carving.grid import Grid
 from geomocap.carving.hull import hull_surface, visual_hull
-from geomocap.carving.settings import CarvingSettings, HullSettings
-from geomocap.carving.views import PinholeViews
+from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.carving.subject_bounds import subject_box
 from geomocap.carving.volume import working_volume
+from geomocap.carving.voxel_grid import Grid
 from geomocap.errors import CalibrationError, GeometryError
 from tests.geomocap.carving_scenes import FIGURE, look_at, ring, silhouettes
 
@@ -54,7 +54,7 @@ def test_cameras_on_an_arc_get_the_whole_hull():
     grid = working_volume([views])
     check_inside(hull_surface(views, grid), grid, 0)
     assert (grid.low <= LOW).all() and (grid.high >= HIGH).all()
-    # along the line of sight the hull is longer than the subject: nobody looks from the side
+    # along the ray the hull is longer than the subject: nobody looks from the side
     assert 1.2 < np.ptp(grid.centers(hull_surface(views, grid))[:, 0]) < 2.0
 
 
@@ -215,7 +215,7 @@ def test_an_empty_silhouette_comes_with_advice_that_can_be_followed():
     with pytest.raises(GeometryError, match=r"camera cam1: its silhouettes are empty, or nearly so, in all 1 frames"):
         working_volume([views], allowed)
     views.masks[:3] = 0
-    with pytest.raises(GeometryError, match=r"out of sight, name the frames that show it in capture\.toml"):
+    with pytest.raises(GeometryError, match=r"out of ray, name the frames that show it in capture\.toml"):
         check_silhouettes(views, 3, HullSettings())
 
 

@@ -10,14 +10,14 @@ import pycolmap
 import pytest
 from scipy.spatial import cKDTree
 
-from geomocap.cameras import Rig
-from geomocap.cloud import CloudFrame, CloudSettings, cloud_of_frame, match_groups
-from geomocap.cloud.bounds import box_depth, hull_depth, inside_silhouettes
-from geomocap.cloud.evidence import Evidence
-from geomocap.cloud.groups import scene_center
-from geomocap.cloud.settings import GroupSettings, TrustSettings
+from geomocap.dense import CloudFrame, CloudSettings, cloud_of_frame, match_groups
+from geomocap.dense.dense_settings import GroupSettings, TrustSettings
+from geomocap.dense.match_evidence import MatchEvidence
+from geomocap.dense.match_groups import scene_center
+from geomocap.dense.search_bounds import box_depth, hull_depth, inside_silhouettes
 from geomocap.errors import CalibrationError, GeometryError
-from geomocap.geometry import Voxels
+from geomocap.model.frame_geometry import Voxels
+from geomocap.model.rig import Rig
 from tests.geomocap.ball import (
     HEIGHT,
     RADIUS,
@@ -47,7 +47,7 @@ def sharp() -> CloudFrame:
 
 
 def completeness(frame: CloudFrame, rig: Rig, least_cosine: float = 0.5) -> float:
-    """Share of the surface that all cameras see not too much at a slant with a point near."""
+    """Fraction of the surface that all cameras see not too much at a slant with a point near."""
     points = surface_points()
     seen = points[(cosines(rig, points) > least_cosine).all(axis=0)]
     return float(np.mean(cKDTree(frame.points.positions).query(seen)[0] < 4 * PIXEL))
@@ -366,7 +366,7 @@ def test_parallel_axes_have_a_scene_too() -> None:
     ],
 )
 def test_evidence(residuals: list[float], growth: float, removed: float, confirmed: float, words: str) -> None:
-    doubt = Evidence(np.array(residuals), growth, removed, confirmed).doubt(TrustSettings())
+    doubt = MatchEvidence(np.array(residuals), growth, removed, confirmed).doubt(TrustSettings())
     assert words in doubt and bool(doubt) == bool(words)
 
 

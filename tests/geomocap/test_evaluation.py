@@ -7,12 +7,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from geomocap.evaluation import EvaluationSettings, evaluate
-from geomocap.evaluation.bodies import adjusted_rand_index
+from geomocap.evaluation.body_scores import adjusted_rand_index
 from geomocap.evaluation.result import EvaluationError
 from geomocap.evaluation.surfaces import read_labelled
 from geomocap.evaluation.truth import Truth
-from geomocap.export.errors import MotionError
-from geomocap.run import Run
+from geomocap.export.export_errors import MotionError
+from geomocap.files.run import Run
 from tests.geomocap.made_truth import flawed_run, truth_arrays, write_truth
 
 
@@ -92,8 +92,8 @@ def test_cloud_against_distances_to_triangles(judged):
     assert result.figures["cloud.accuracy_median"] == pytest.approx(np.median(accuracy), abs=0.3)
     assert result.figures["cloud.accuracy_p95"] == pytest.approx(np.percentile(accuracy, 95), abs=0.5)
     assert result.figures["cloud.completeness_median"] == pytest.approx(np.median(completeness), abs=1e-3)
-    share = np.mean(completeness < 10)
-    assert result.figures["cloud.share_of_surface_within_10mm"] == pytest.approx(share, abs=1e-3)
+    fraction = np.mean(completeness < 10)
+    assert result.figures["cloud.fraction_of_surface_within_10mm"] == pytest.approx(fraction, abs=1e-3)
 
 
 def test_bodies_against_counting(judged):
@@ -111,7 +111,7 @@ def test_bodies_against_counting(judged):
     assert result.figures["bodies.adjusted_rand_index_worst_frame"] == pytest.approx(np.min(index), abs=0.03)
     assert result.figures["bodies.found"] == 4
     # Weights are one or zero: nearly everything near the surface is core.
-    assert result.figures["bodies.core_share"] > 0.95
+    assert result.figures["bodies.core_fraction"] > 0.95
 
 
 def test_joints_against_loops(judged):

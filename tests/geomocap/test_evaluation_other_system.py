@@ -12,7 +12,7 @@ from geomocap.export.bvh import write_bvh
 from geomocap.export.markers import Markers
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.trc import write_trc
-from geomocap.run import Run
+from geomocap.files.run import Run
 from tests.geomocap.articulated import skeleton_arrays
 
 OFFSET = 0.37

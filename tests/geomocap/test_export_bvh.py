@@ -5,7 +5,7 @@ import pytest
 
 from geomocap.export.bvh import read_bvh, write_bvh
 from geomocap.export.conventions import BVH, Convention
-from geomocap.export.errors import MotionError
+from geomocap.export.export_errors import MotionError
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from tests.geomocap.articulated import skeleton_arrays
 

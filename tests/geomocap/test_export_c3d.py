@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from geomocap.export.c3d import read_c3d, write_c3d
-from geomocap.export.errors import MotionError
+from geomocap.export.export_errors import MotionError
 from geomocap.export.markers import Markers, markers_from_run
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from tests.geomocap.articulated import skeleton_arrays

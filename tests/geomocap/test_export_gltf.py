@@ -3,7 +3,7 @@ import pygltflib
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geomocap.export.gltf import write_glb
+from geomocap.export.glb import write_glb
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.skinned_mesh import bone_mesh
 from tests.geomocap.articulated import skeleton_arrays
@@ -13,7 +13,7 @@ WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 class Glb:
-    """A reader that follows the glTF 2.0 specification and shares nothing with the writer."""
+    """A reader that follows the glTF 2.0 specification and fractions nothing with the writer."""
 
     def __init__(self, path):
         self.file = pygltflib.GLTF2.load(str(path))

@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from geomocap.export.errors import MotionError
-from geomocap.export.hierarchy import body_tree
+from geomocap.export.body_tree import body_tree
+from geomocap.export.export_errors import MotionError
 from geomocap.export.names import Names
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from tests.geomocap.articulated import skeleton_arrays

@@ -5,12 +5,12 @@ import pytest
 
 from geomocap.errors import RunError, SettingsError
 from geomocap.export.bvh import read_bvh
-from geomocap.export.errors import MotionError
+from geomocap.export.export_errors import MotionError
+from geomocap.export.export_settings import ExportSettings
 from geomocap.export.names import Names
 from geomocap.export.run_export import FILES, export_run
-from geomocap.export.settings import ExportSettings
 from geomocap.export.trc import read_trc
-from geomocap.run import Run
+from geomocap.files.run import Run
 from tests.geomocap.articulated import skeleton_arrays
 
 

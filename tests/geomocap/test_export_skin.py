@@ -3,13 +3,13 @@ import open3d as o3d
 import pytest
 from scipy.spatial import cKDTree
 
-from geomocap.export.errors import MotionError
-from geomocap.export.rotations import rotation_about
-from geomocap.export.settings import ExportSettings
+from geomocap.export.export_errors import MotionError
+from geomocap.export.export_settings import ExportSettings
+from geomocap.export.file_rotations import rotation_about
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.skin import majority, node_of_body, skin_from_run, skin_weights
-from geomocap.export.surface import Surface, point_spacing, shell_normals, surface_through
-from geomocap.run import Run
+from geomocap.files.run import Run
+from geomocap.model.surface import Surface, point_spacing, shell_normals, surface_through
 
 VOXEL = 0.02
 RADIUS = 0.1

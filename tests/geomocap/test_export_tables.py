@@ -37,7 +37,7 @@ def test_read_back_by_pandas(tmp_path, ending):
 
 
 def test_frames_must_agree():
-    from geomocap.export.errors import MotionError
+    from geomocap.export.export_errors import MotionError
 
     with pytest.raises(MotionError, match="3 frames of markers, but 20"):
         motion_table(Markers(("a",), np.zeros((3, 1, 3)), 15.0), motion_from_skeleton(skeleton_arrays()))

@@ -3,7 +3,7 @@ import csv
 import numpy as np
 import pytest
 
-from geomocap.export.errors import MotionError
+from geomocap.export.export_errors import MotionError
 from geomocap.export.markers import Markers, markers_from_run
 from geomocap.export.trc import read_trc, write_trc
 from tests.geomocap.articulated import skeleton_arrays

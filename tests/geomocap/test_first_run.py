@@ -7,7 +7,7 @@ import sys
 import pytest
 
 TRACKING = """
-from geomocap.tracking.patch_tracking import track_surface
+from geomocap.patches.patch_tracking import track_surface
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
 from tests.geomocap.test_tracking_patches import SETTINGS
 views = [MovingEllipsoid().view(k) for k in range(6)]

@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geomocap.articulation.hinges import find_hinges, hinge_axis, turn_information
-from geomocap.articulation.kinematics import Linkage, body_motion, joint_motion
-from geomocap.articulation.observations import SkinPoints
-from geomocap.articulation.refinement import refine_motion
-from geomocap.segmentation.motion_paths import MotionPaths
-from geomocap.segmentation.rigid_motions import fit_rigid_motion
-from geomocap.skeleton.hierarchy import Hierarchy
+from geomocap.bodies.rigid_motions import fit_rigid_motion
+from geomocap.model.hierarchy import Hierarchy
+from geomocap.model.motion_paths import MotionPaths
+from geomocap.skeleton.body_observations import SkinPoints
+from geomocap.skeleton.hinges import find_hinges, hinge_axis, turn_information
+from geomocap.skeleton.kinematics import Linkage, body_motion, joint_motion
+from geomocap.skeleton.refinement import refine_motion
 from tests.geomocap.moving_chains import chain
 
 NOISE = 0.004
@@ -52,7 +52,7 @@ def test_information_is_the_inverse_covariance_of_turns():
     seen = rng.random((180, 30)) < 0.7
     bodies = body_motion(linkage, motion)
     information = turn_information(linkage, bodies, points, seen, np.full(180, NOISE**-2))
-    # the parent's turn and the child's, each about the joint, from many noisy sightings of one frame
+    # the parent's turn and the child's, each about the joint, from many noisy observations of one frame
     t, found = 20, []
     lever = points.rest - linkage.joints[0]
     for _ in range(3000):

@@ -4,10 +4,10 @@ import pytest
 import trimesh
 from cv2 import imwrite
 
-from geomocap.cameras import Rig
 from geomocap.export.run_export import export_run
 from geomocap.inspection import describe
 from geomocap.inspection.describe import InspectionError
+from geomocap.model.rig import Rig
 from tests.geomocap.articulated import skeleton_arrays
 from tests.geomocap.made_truth import flawed_run, write_truth
 
@@ -134,7 +134,7 @@ def test_a_truth(tmp_path):
 
 @pytest.fixture
 def motion_files(tmp_path):
-    from geomocap.run import Run
+    from geomocap.files.run import Run
 
     run = Run(tmp_path / "run")
     run.write_npz("skeleton.npz", **skeleton_arrays())

@@ -4,7 +4,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
-from geomocap.tracking.keypoints import follow_keypoints
+from geomocap.keypoints.keypoint_following import follow_keypoints
 from tests.geomocap.made_trajectories import make_tracks, rigid_tracks
 
 SHIFT, TURN = np.array([0.01, -0.005, 0.002]), np.array([1.0, 2.0, 5.0])

@@ -7,19 +7,19 @@ import pytest
 
 from geomocap.matching import grow_kernel as gk
 from geomocap.matching.epipolar import transfers
-from geomocap.matching.grid import Grid
 from geomocap.matching.growing import consistent, regions
 from geomocap.matching.lsm import Matches
+from geomocap.matching.match_grid import MatchGrid
+from geomocap.matching.matching_settings import GrowingSettings, SeedSettings
 from geomocap.matching.plane_sweep import SweepImages
 from geomocap.matching.seeds import DepthRange, Seeds, find_seeds
-from geomocap.matching.settings import GrowingSettings, SeedSettings
 from tests.geomocap.ball import RADIUS, Texture, photograph, ring
 
 
 def test_grid_covers_the_mask_and_knows_its_neighbours() -> None:
     mask = np.zeros((40, 60), bool)
     mask[10:30, 20:50] = True
-    grid = Grid.over(mask.shape, 2.0, mask)
+    grid = MatchGrid.over(mask.shape, 2.0, mask)
     assert len(grid) == 10 * 15
     rows, columns = (grid.pixels[:, ::-1].T).astype(int)
     assert mask[rows, columns].all()
@@ -29,7 +29,7 @@ def test_grid_covers_the_mask_and_knows_its_neighbours() -> None:
         np.testing.assert_allclose(grid.pixels[side[there]] - grid.pixels[there], np.tile(way, (there.sum(), 1)))
     assert (left < 0).sum() == 10 and (above < 0).sum() == 15
     np.testing.assert_array_equal(grid.image(np.arange(150), -1)[grid.row, grid.column], np.arange(150))
-    assert len(Grid.over((20, 20), 2.0, np.zeros((20, 20)))) == 0
+    assert len(MatchGrid.over((20, 20), 2.0, np.zeros((20, 20)))) == 0
 
 
 def seeds_at(pixels: np.ndarray) -> Seeds:
@@ -37,7 +37,7 @@ def seeds_at(pixels: np.ndarray) -> Seeds:
 
 
 def test_regions_are_those_of_the_nearest_seed() -> None:
-    grid = Grid.over((60, 80), 2.0)
+    grid = MatchGrid.over((60, 80), 2.0)
     pixels = np.random.default_rng(0).uniform([5, 5], [75, 55], (12, 2))
     region, begin = regions(grid, seeds_at(pixels))
     nearest = np.linalg.norm(grid.pixels[:, None] - pixels[None], axis=2).argmin(axis=1)
@@ -47,7 +47,7 @@ def test_regions_are_those_of_the_nearest_seed() -> None:
     assert (none[0] == -1).all() and len(none[1]) == 0
 
 
-def plane_matches(grid: Grid, affine: np.ndarray) -> Matches:
+def plane_matches(grid: MatchGrid, affine: np.ndarray) -> Matches:
     """Matches of a plane in two images."""
     n = len(grid)
     positions = np.repeat((grid.pixels @ affine.T)[:, None], 2, axis=1)
@@ -65,7 +65,7 @@ def plane_matches(grid: Grid, affine: np.ndarray) -> Matches:
 
 
 def test_consistency_removes_strays_and_islands_only() -> None:
-    grid = Grid.over((60, 80), 2.0)
+    grid = MatchGrid.over((60, 80), 2.0)
     affine = np.array([[0.9, 0.1], [-0.1, 1.1]])
     matches = plane_matches(grid, affine)
     matched = np.ones(len(grid), bool)
@@ -113,7 +113,7 @@ def test_no_seeds_outside_the_depth_range() -> None:
 
 def test_best_neighbours_as_written_out() -> None:
     rng = np.random.default_rng(0)
-    grid = Grid.over((30, 40), 2.0, rng.random((30, 40)) < 0.9)
+    grid = MatchGrid.over((30, 40), 2.0, rng.random((30, 40)) < 0.9)
     n = len(grid)
     planes = np.zeros((n, gk.PLANE))
     planes[:, gk.IMAGES] = rng.integers(0, 3, n)

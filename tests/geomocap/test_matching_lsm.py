@@ -8,12 +8,12 @@ import pycolmap
 import pytest
 from scipy import ndimage, optimize
 
-from geomocap.cameras import Rig
 from geomocap.errors import CalibrationError
 from geomocap.matching.epipolar import plane_affine, seen_at, transfers
 from geomocap.matching.lsm import REASONS, match_multi, match_pairs
-from geomocap.matching.settings import KernelSettings
+from geomocap.matching.matching_settings import KernelSettings
 from geomocap.matching.spline import NOISE_SLOPE, NOISE_VALUE, ImageStack, SplineImage
+from geomocap.model.rig import Rig
 from tests.geomocap.speckle import Speckle, recorded
 
 HEIGHT, WIDTH = 240, 320
@@ -53,7 +53,7 @@ def test_spline_runs_through_the_pixels_and_agrees_with_scipy(order: int) -> Non
 
 
 @pytest.mark.parametrize("order", [3, 5])
-def test_share_of_noise_that_a_spline_keeps(order: int) -> None:
+def test_fraction_of_noise_that_a_spline_keeps(order: int) -> None:
     impulse = np.zeros(101)
     impulse[50] = 1
     row = order // 4

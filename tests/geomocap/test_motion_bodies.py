@@ -5,20 +5,20 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from geomocap.bodies.body_criteria import fixed_fraction, may_be_joined
+from geomocap.bodies.motion_bodies import MotionBodiesSettings, find_motion_bodies
+from geomocap.bodies.point_labels import label_points
+from geomocap.bodies.rigid_motions import turn_angles
 from geomocap.errors import GeometryError
-from geomocap.pipeline.motion import unsure_turns
-from geomocap.segmentation.body_criteria import fixed_share, may_be_joined
-from geomocap.segmentation.motion_bodies import MotionBodiesSettings, find_motion_bodies
-from geomocap.segmentation.motion_labels import label_points
-from geomocap.segmentation.motion_paths import MotionPaths
-from geomocap.segmentation.rigid_motions import turn_angles
-from geomocap.segmentation.track_completion import complete_tracks
+from geomocap.model.hierarchy import Hierarchy
+from geomocap.model.motion_paths import MotionPaths
+from geomocap.pipeline.motion_stage import unsure_turns
 from geomocap.skeleton.articulated_motion import fit_articulated, prior_moments
 from geomocap.skeleton.borders import Border
 from geomocap.skeleton.common_points import common_point
-from geomocap.skeleton.hierarchy import Hierarchy
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
 from geomocap.skeleton.temporal_smoothing import smooth_positions, smooth_rotations
+from geomocap.trajectories.completion import complete_tracks
 from tests.geomocap.moving_chains import chain, same_partition, seen_by_single_cameras
 
 
@@ -119,12 +119,12 @@ def test_deep_soft_skin_between_three_bodies_is_no_fourth(seed):
     three = chain(3, samples=200, turn_deg=70.0, seed=seed)
     rest = three.positions[:, 0]
     up, down = (np.clip((rest[:, 0] - joint + 0.25) / 0.5, 0.0, 1.0) for joint in (0.4, 0.8))
-    up, down = (share**2 * (3.0 - 2.0 * share) for share in (up, down))
+    up, down = (fraction**2 * (3.0 - 2.0 * fraction) for fraction in (up, down))
     weights = np.stack([1 - up, up * (1 - down), up * down], axis=1)
     weights /= weights.sum(axis=1, keepdims=True)
     carried = np.einsum("tbij,nj->nbti", three.rotations, rest) + three.translations.swapaxes(0, 1)[None]
     paths = MotionPaths(np.einsum("nb,nbti->nti", weights, carried))
-    assert find_motion_bodies(paths, MotionBodiesSettings(soft_share=0.0)).body_count > 3
+    assert find_motion_bodies(paths, MotionBodiesSettings(soft_fraction=0.0)).body_count > 3
     pieces = np.digitize(rest[:, 0], np.linspace(0.0, 1.2, 10)[1:-1])  # rigid parts are no skin
     assert find_motion_bodies(replace(paths, parts=pieces)).body_count > 3
     bodies = find_motion_bodies(paths)
@@ -133,17 +133,17 @@ def test_deep_soft_skin_between_three_bodies_is_no_fourth(seed):
     assert same_partition(bodies.label[core], weights[core].argmax(axis=1)) > 0.97
 
 
-def test_fixed_share_of_a_turn():
+def test_fixed_fraction_of_a_turn():
     rng = np.random.default_rng(9)
     first = Rotation.from_rotvec(rng.normal(scale=0.4, size=(30, 3)))
     turns = rng.normal(scale=0.4, size=(30, 3))
     middle, second = first * Rotation.from_rotvec(0.3 * turns), first * Rotation.from_rotvec(turns)
-    share, miss, turn = fixed_share(first.as_matrix(), middle.as_matrix(), second.as_matrix())
-    assert share == pytest.approx(0.3)
+    fraction, miss, turn = fixed_fraction(first.as_matrix(), middle.as_matrix(), second.as_matrix())
+    assert fraction == pytest.approx(0.3)
     assert miss < 1e-9
     assert turn == pytest.approx(np.quantile(np.linalg.norm(turns, axis=1), 0.95))
     other = first * Rotation.from_rotvec(rng.normal(scale=0.4, size=(30, 3)))
-    assert fixed_share(first.as_matrix(), other.as_matrix(), second.as_matrix())[1] > 0.3
+    assert fixed_fraction(first.as_matrix(), other.as_matrix(), second.as_matrix())[1] > 0.3
 
 
 def test_what_turns_alike_elsewhere_is_not_joined(three):
@@ -182,10 +182,10 @@ def test_a_single_rigid_body_is_one_without_joints(moving):
 
 
 def test_bodies_that_single_cameras_see_turn_as_what_they_see_across_says(three):
-    positions, sight = seen_by_single_cameras(three, 0.02)
+    positions, ray = seen_by_single_cameras(three, 0.02)
     errors = []
-    for known in (None, sight):
-        paths = MotionPaths(positions, sigma=np.full(270, 0.012), sight=known)
+    for known in (None, ray):
+        paths = MotionPaths(positions, sigma=np.full(270, 0.012), ray=known)
         bodies = find_motion_bodies(paths, MotionBodiesSettings(bodies=3))
         true = [np.bincount(three.body[bodies.label == b]).argmax() for b in range(3)]
         difference = np.swapaxes(bodies.rotations, 2, 3) @ three.rotations[:, true]
@@ -374,17 +374,20 @@ def test_completion_carries_gaps_with_the_neighbours(three):
 @pytest.mark.parametrize(("halved", "bodies"), [(1, 3), (2, 2)])
 def test_a_small_body_is_one_if_others_hang_together_by_it(three, halved, bodies):
     kept = (three.body != halved) | (np.arange(len(three.body)) % 2 == 0)
-    settings = MotionBodiesSettings(min_share=0.22)  # of the samples 2/5, 2/5 and 1/5
+    settings = MotionBodiesSettings(min_fraction=0.22)  # of the samples 2/5, 2/5 and 1/5
     assert find_motion_bodies(MotionPaths(three.positions[kept]), settings).body_count == bodies
 
 
 def test_what_single_cameras_see_counts_less_in_the_size_of_a_body(three):
     kept = (three.body != 2) | (np.arange(len(three.body)) % 2 == 0)
-    positions, settings = three.positions[kept], MotionBodiesSettings(min_share=0.16)  # the last has 1/5 of the samples
-    sight = seen_by_single_cameras(three, 0.0)[1][kept]
+    positions, settings = (
+        three.positions[kept],
+        MotionBodiesSettings(min_fraction=0.16),
+    )  # the last has 1/5 of the samples
+    ray = seen_by_single_cameras(three, 0.0)[1][kept]
     assert find_motion_bodies(MotionPaths(positions), settings).body_count == 3
-    assert find_motion_bodies(MotionPaths(positions, sight=sight), settings).body_count == 2
-    assert find_motion_bodies(MotionPaths(positions, sight=sight), MotionBodiesSettings()).body_count == 3
+    assert find_motion_bodies(MotionPaths(positions, ray=ray), settings).body_count == 2
+    assert find_motion_bodies(MotionPaths(positions, ray=ray), MotionBodiesSettings()).body_count == 3
 
 
 def test_precision_beyond_what_surfaces_give_hardly_counts():

@@ -8,8 +8,8 @@ import pytest
 import trimesh
 
 from geomocap.errors import GeometryError
-from geomocap.geometry import BodyPoints, Voxels
-from geomocap.open3d_files import check_ply, read_by_open3d
+from geomocap.files.open3d_geometry import check_ply, read_by_open3d
+from geomocap.model.frame_geometry import BodyPoints, Voxels
 
 HEADER = b"ply\nformat ascii 1.0\nelement vertex"
 

@@ -10,14 +10,14 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from geomocap.capture import Capture, CaptureInfo, write_capture_info
-from geomocap.cloud import CloudSettings
 from geomocap.config import load_config
+from geomocap.dense import CloudSettings
 from geomocap.errors import GeometryError, RunError
+from geomocap.files.capture import Capture, CaptureInfo, write_capture_info
+from geomocap.files.run import Run
 from geomocap.pipeline import Job, clouds, read_cloud_record
-from geomocap.pipeline.clouds import bounds_of, measure_again
+from geomocap.pipeline.cloud_stage import bounds_of, measure_again
 from geomocap.pipeline.sources import CloudFrames
-from geomocap.run import Run
 from geomocap.scheduling import threads
 from tests.geomocap.ball import Texture, off_surface, photograph, ring
 

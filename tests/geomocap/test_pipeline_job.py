@@ -8,9 +8,9 @@ import pytest
 
 from geomocap.config import Config, load_config
 from geomocap.errors import CalibrationError
+from geomocap.files.run import Run
 from geomocap.pipeline import Job, silhouettes
 from geomocap.pipeline import voxels as carve
-from geomocap.run import Run
 from geomocap.scheduling import threads
 from tests.geomocap.test_pipeline_clouds import make_capture
 

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from geomocap.errors import RunError, SettingsError
 from geomocap.export.c3d import read_c3d
 from geomocap.export.trc import read_trc
-from geomocap.pipeline.keypoints import keypoints
-from geomocap.run import Run
-from geomocap.tracking.keypoint_file import KeyPoint, KeyPointFile, read_keypoints, write_keypoints
+from geomocap.files.run import Run
+from geomocap.keypoints.keypoint_regions import KeyPoint, KeyPointFile, read_keypoints, write_keypoints
+from geomocap.pipeline.keypoint_stage import keypoints
 
 FILE = """
 links = [["wrist", "heel"]]

@@ -10,11 +10,11 @@ import pytest
 
 from geomocap.config import Config
 from geomocap.errors import GeometryError
+from geomocap.files.run import Run
+from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.paths import ALONE_SHARE, motion_paths, patch_paths
-from geomocap.run import Run
-from geomocap.segmentation.settings import SegmentationSettings
-from geomocap.tracking.node_settings import NodeTrackingSettings
+from geomocap.pipeline.path_choice import ALONE_FRACTION, motion_paths, patch_paths
+from geomocap.segmentation.m3_settings import SegmentationSettings
 
 FRAMES = 3
 
@@ -103,12 +103,12 @@ def test_patches_that_are_not_there(job):
 
 def test_lines_of_sight_go_with_the_paths_where_single_cameras_saw_them():
     tracks = trajectories(40, 1.0)
-    tracked = {"positions": tracks, "sigma": np.full(tracks.shape[:2], 0.002), "sight": np.zeros(tracks.shape)}
+    tracked = {"positions": tracks, "sigma": np.full(tracks.shape[:2], 0.002), "ray": np.zeros(tracks.shape)}
     found = patch_paths(tracked)
-    assert found is not None and found.sight is None
-    tracked["sight"][::2, 1] = [0.0, 0.6, 0.8]
+    assert found is not None and found.ray is None
+    tracked["ray"][::2, 1] = [0.0, 0.6, 0.8]
     found = patch_paths(tracked)
-    assert found is not None and found.sight is not None and found.sigma is not None
-    np.testing.assert_array_equal(found.sight, tracked["sight"])
-    np.testing.assert_allclose(found.sigma[::2, 1], 0.002 * ALONE_SHARE)
+    assert found is not None and found.ray is not None and found.sigma is not None
+    np.testing.assert_array_equal(found.ray, tracked["ray"])
+    np.testing.assert_allclose(found.sigma[::2, 1], 0.002 * ALONE_FRACTION)
     np.testing.assert_allclose(np.delete(found.sigma, 1, axis=1), 0.002)

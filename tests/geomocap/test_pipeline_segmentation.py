@@ -9,14 +9,14 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from geomocap.capture import Capture
 from geomocap.config import load_config
 from geomocap.errors import SettingsError
 from geomocap.export.trc import read_trc
+from geomocap.files.capture import Capture
+from geomocap.files.run import Run
+from geomocap.files.scans import open_scans
 from geomocap.pipeline import Job, motion_files, segment
 from geomocap.pipeline.derived import KEYPOINT_FILES
-from geomocap.run import Run
-from geomocap.scans import open_scans
 from geomocap.scheduling import threads
 from tests.geomocap.moving_chains import chain
 

@@ -6,13 +6,13 @@ import numpy as np
 from numpy.testing import assert_allclose
 
 from geomocap.config import load_config
+from geomocap.files.run import Run
 from geomocap.pipeline import Job
 from geomocap.pipeline.derived import KEYPOINT_FILES
-from geomocap.run import Run
 from geomocap.scheduling import threads
 from tests.geomocap.test_pipeline_clouds import make_capture
 
-stage = importlib.import_module("geomocap.pipeline.tracks")
+stage = importlib.import_module("geomocap.pipeline.track_stage")
 
 
 def test_a_cloud_becomes_the_voxels_that_hold_its_points():

@@ -9,9 +9,9 @@ import open3d as o3d
 import pytest
 
 from geomocap.errors import RunError
-from geomocap.files import write_atomic, write_text
-from geomocap.geometry import Voxels
-from geomocap.run import Run, stage_key
+from geomocap.files.atomic import write_atomic, write_text
+from geomocap.files.run import Run, stage_key
+from geomocap.model.frame_geometry import Voxels
 
 
 def test_interrupted_writing_leaves_nothing(tmp_path):

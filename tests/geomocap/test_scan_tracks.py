@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from geomocap.config import load_config
 from geomocap.errors import GeometryError
+from geomocap.files.run import Run
+from geomocap.files.scan_geometry import ScanSurface, places_on
+from geomocap.files.scan_tracks import scan_tracks
+from geomocap.files.scans import Scans, ScanSettings, open_scans
 from geomocap.pipeline import Job, segment
-from geomocap.run import Run
-from geomocap.scan_files import Surface, places_on
-from geomocap.scan_tracks import scan_tracks
-from geomocap.scans import Scans, ScanSettings, open_scans
 from geomocap.scheduling import threads
 
 T = 5
@@ -95,7 +95,7 @@ def test_points_in_any_order_are_no_tracks_unless_they_are_said_to_be(tmp_path):
 
 
 def test_a_surface_sampled_anew_in_the_order_of_its_triangles_gives_no_tracks(tmp_path):
-    ball = Surface(np.array(BALL.vertices), np.array(BALL.faces))
+    ball = ScanSurface(np.array(BALL.vertices), np.array(BALL.faces))
     points = [moved(places_on(ball, 2000, seed=k).of(ball.points), k) for k in range(T)]
     assert scan_tracks(scans_of(points, tmp_path)) is None
 

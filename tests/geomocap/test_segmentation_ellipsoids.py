@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
+from geomocap.model.ellipsoids import check_points, fit_ellipsoids
 from geomocap.segmentation.contacts import count_contacts
-from geomocap.segmentation.ellipsoids import check_points, fit_ellipsoids
 
 
 def shell(rng: np.random.Generator, radii: np.ndarray, count: int) -> np.ndarray:

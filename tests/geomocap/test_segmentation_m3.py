@@ -7,12 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
-from geomocap.segmentation.bodies import group_paths, path_integrals, similarity_threshold, unite
-from geomocap.segmentation.ellipsoids import fit_ellipsoids
+from geomocap.model.ellipsoids import fit_ellipsoids
+from geomocap.model.rotations import nearest_rotation
 from geomocap.segmentation.m3 import segment_m3
-from geomocap.segmentation.rotations import nearest_rotation
-from geomocap.segmentation.segmentation import Segmentation
-from geomocap.segmentation.settings import SegmentationSettings
+from geomocap.segmentation.m3_result import Segmentation
+from geomocap.segmentation.m3_settings import SegmentationSettings
+from geomocap.segmentation.relative_paths import group_paths, path_integrals, similarity_threshold, unite
 from tests.geomocap.segmentation_scenes import hinged_arm
 
 SPACING = 0.008

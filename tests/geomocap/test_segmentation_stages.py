@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
-from geomocap.segmentation.ellipsoids import fit_ellipsoids
-from geomocap.segmentation.matching import assign_tree, first_frame, match_frame, match_frames
-from geomocap.segmentation.merging import merge_frame
-from geomocap.segmentation.settings import SegmentationSettings
-from geomocap.segmentation.splitting import SplitFrame, split_frame
+from geomocap.model.ellipsoids import fit_ellipsoids
+from geomocap.segmentation.ellipsoid_matching import assign_tree, first_frame, match_frame, match_frames
+from geomocap.segmentation.ellipsoid_merging import merge_frame
+from geomocap.segmentation.ellipsoid_splitting import SplitFrame, split_frame
+from geomocap.segmentation.m3_settings import SegmentationSettings
 from tests.geomocap.segmentation_scenes import capsule
 
 SPACING = 0.01

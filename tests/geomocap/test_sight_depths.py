@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from geomocap.segmentation import sight_depths
-from geomocap.segmentation.motion_bodies import MotionBodies, MotionBodiesSettings, find_motion_bodies
-from geomocap.segmentation.motion_paths import MotionPaths
-from geomocap.segmentation.sight_depths import find_bodies_and_depths, place_samples, settle_depths
-from geomocap.segmentation.skin_blending import solve_symmetric
+from geomocap.bodies import ray_depths as ray_depths
+from geomocap.bodies.motion_bodies import MotionBodies, MotionBodiesSettings, find_motion_bodies
+from geomocap.bodies.ray_depths import find_bodies_and_depths, place_samples, settle_depths
+from geomocap.bodies.skin_blending import solve_symmetric
+from geomocap.model.motion_paths import MotionPaths
 from tests.geomocap.moving_chains import chain, same_partition, seen_by_single_cameras
 
-DEPTH_SHARE = 0.05
+DEPTH_FRACTION = 0.05
 
 
 def test_small_systems_are_solved_as_numpy_does():
@@ -34,12 +34,12 @@ def three():
 @pytest.fixture(scope="module")
 def alone(three):
     """The chain as single cameras see it, its hull 30 mm off by turns; and a part of it 100 mm before the surface."""
-    positions, sight = seen_by_single_cameras(three, 0.03)
-    ghost = (three.body == 1) & (sight[:, 0, 1] > 0)
-    positions[ghost] -= 0.1 * sight[ghost]
+    positions, ray = seen_by_single_cameras(three, 0.03)
+    ghost = (three.body == 1) & (ray[:, 0, 1] > 0)
+    positions[ghost] -= 0.1 * ray[ghost]
     positions[4, 7:11] = np.nan
-    sight[4, 7:11] = 0.0
-    return MotionPaths(positions, sigma=np.full(len(positions), 0.02), sight=sight)
+    ray[4, 7:11] = 0.0
+    return MotionPaths(positions, sigma=np.full(len(positions), 0.02), ray=ray)
 
 
 @pytest.fixture(scope="module")
@@ -51,14 +51,14 @@ def test_kernel_is_exact_against_numpy(three, alone):
     rng = np.random.default_rng(1)
     seen = alone.seen & (rng.random(alone.seen.shape) < 0.9)
     positions = np.nan_to_num(alone.positions)
-    share = rng.random((len(positions), 3))
-    share /= share.sum(axis=1, keepdims=True)
-    turns = np.einsum("nb,tbij->ntij", share, three.rotations)
-    shifts = np.einsum("nb,tbi->nti", share, three.translations)
-    sight = np.where((rng.random(len(positions)) < 0.8)[:, None, None], alone.sight, 0.0)
+    fraction = rng.random((len(positions), 3))
+    fraction /= fraction.sum(axis=1, keepdims=True)
+    turns = np.einsum("nb,tbij->ntij", fraction, three.rotations)
+    shifts = np.einsum("nb,tbi->nti", fraction, three.translations)
+    ray = np.where((rng.random(len(positions)) < 0.8)[:, None, None], alone.ray, 0.0)
     for rotations, translations in ((turns, shifts), (turns[:1], shifts[:1])):
-        rest, miss, depth = place_samples(positions, seen, sight, rotations, translations, DEPTH_SHARE, 0.05)
-        sure = np.eye(3) - (1 - DEPTH_SHARE**2) * sight[..., :, None] * sight[..., None, :]
+        rest, miss, depth = place_samples(positions, seen, ray, rotations, translations, DEPTH_FRACTION, 0.05)
+        sure = np.eye(3) - (1 - DEPTH_FRACTION**2) * ray[..., :, None] * ray[..., None, :]
         carry = np.broadcast_to(rotations, turns.shape)
         away = positions - translations
         normal = np.einsum("nt,ntji,ntjk,ntkl->nil", seen, carry, sure, carry) + 1e-9 * np.eye(3)
@@ -67,8 +67,8 @@ def test_kernel_is_exact_against_numpy(three, alone):
         ]
         assert_allclose(rest, expected, rtol=1e-9, atol=1e-12)
         left = np.einsum("ntij,nj->nti", carry, expected) - away
-        along = (left * sight).sum(axis=2)
-        across = np.minimum(((left - along[..., None] * sight) ** 2).sum(axis=2), 0.05**2)
+        along = (left * ray).sum(axis=2)
+        across = np.minimum(((left - along[..., None] * ray) ** 2).sum(axis=2), 0.05**2)
         assert_allclose(depth, np.where(seen, along, 0.0), atol=1e-10)
         assert_allclose(miss, np.sqrt((across * seen).sum(axis=1) / seen.sum(axis=1)), atol=1e-10)
 
@@ -85,24 +85,24 @@ def test_depths_are_those_with_which_bodies_are_rigid(three, alone, bodies):
 def test_positions_move_along_their_lines_of_sight_only(alone, bodies):
     settled = settle_depths(alone, bodies)
     moved = (settled.positions - alone.positions)[alone.seen]
-    sight = alone.sight[alone.seen]
-    assert_allclose(moved, (moved * sight).sum(axis=1, keepdims=True) * sight, atol=1e-12)
+    ray = alone.ray[alone.seen]
+    assert_allclose(moved, (moved * ray).sum(axis=1, keepdims=True) * ray, atol=1e-12)
     assert_array_equal(settled.seen, alone.seen)
-    assert settled.sight is alone.sight
+    assert settled.ray is alone.ray
 
 
 def test_what_several_cameras_see_stays(three, bodies, alone):
-    positions, sight = seen_by_single_cameras(three, 0.03)
-    sight[::2] = 0.0
+    positions, ray = seen_by_single_cameras(three, 0.03)
+    ray[::2] = 0.0
     positions[::2] = three.positions[::2]
-    settled = settle_depths(MotionPaths(positions, sight=sight), bodies)
+    settled = settle_depths(MotionPaths(positions, ray=ray), bodies)
     assert_array_equal(settled.positions[::2], positions[::2])
     known = MotionPaths(three.positions)
     assert settle_depths(known, bodies) is known
 
 
 def test_a_piece_before_the_surface_comes_to_the_body_behind_it(three, alone, bodies):
-    piece = (three.body == 1) & (alone.sight[:, 0, 1] > 0)
+    piece = (three.body == 1) & (alone.ray[:, 0, 1] > 0)
     torn = MotionBodies(**{**bodies.__dict__, **_with_a_body_of(piece, bodies)})
     settled = settle_depths(alone, torn)
     error = np.linalg.norm(settled.positions - three.positions, axis=2)[piece]
@@ -148,8 +148,8 @@ def test_the_fewest_bodies_of_all_rounds_are_taken(monkeypatch, alone, bodies):
         found.append((replace(bodies, rotations=bodies.rotations[:, np.arange(count) % bodies.body_count]), paths))
         return found[-1][0]
 
-    monkeypatch.setattr(sight_depths, "find_motion_bodies", find)
-    monkeypatch.setattr(sight_depths, "settle_depths", lambda paths, _: replace(paths))
+    monkeypatch.setattr(ray_depths, "find_motion_bodies", find)
+    monkeypatch.setattr(ray_depths, "settle_depths", lambda paths, _: replace(paths))
     settings = MotionBodiesSettings(depth_rounds=3)
     best, paths = find_bodies_and_depths(alone, settings, lambda *step: reported.append(step))
     assert best is found[2][0] and paths is found[2][1]

@@ -7,14 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
+from geomocap.model.hierarchy import Hierarchy, connect_bodies
+from geomocap.segmentation.axis_joints import grow_joints
 from geomocap.segmentation.m3 import segment_m3
-from geomocap.segmentation.segmentation import Segmentation
-from geomocap.segmentation.settings import SegmentationSettings
-from geomocap.skeleton.hierarchy import Hierarchy, connect_bodies
-from geomocap.skeleton.joints import grow_joints
-from geomocap.skeleton.motion import fit_motion, fit_offsets, forward_kinematics, local_rotations
-from geomocap.skeleton.settings import SkeletonSettings
-from geomocap.skeleton.skeleton import Skeleton, skeleton_m3
+from geomocap.segmentation.m3_result import Segmentation
+from geomocap.segmentation.m3_settings import SegmentationSettings
+from geomocap.segmentation.skeleton_settings import SkeletonSettings
+from geomocap.skeleton.bone_motion import fit_motion, fit_offsets, forward_kinematics, local_rotations
+from geomocap.skeleton.m3_skeleton import Skeleton, skeleton_m3
 from tests.geomocap.segmentation_scenes import hinged_arm
 
 SPACING = 0.008
@@ -88,9 +88,9 @@ def test_joint_of_touching_ends_and_of_apart_bodies():
 def test_connections_follow_contact_and_order():
     contacts = np.zeros((5, 5))
     touching = np.zeros((5, 5))
-    for a, b, amount, share in [(0, 1, 9, 1.0), (1, 2, 5, 0.9), (0, 2, 50, 0.1), (0, 3, 3, 0.2)]:
+    for a, b, amount, fraction in [(0, 1, 9, 1.0), (1, 2, 5, 0.9), (0, 2, 50, 0.1), (0, 3, 3, 0.2)]:
         contacts[a, b] = contacts[b, a] = amount
-        touching[a, b] = touching[b, a] = share
+        touching[a, b] = touching[b, a] = fraction
     centers = np.array([[[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0], [0, 2, 0]]])
     tree = connect_bodies(contacts, touching, centers, 0.5)
     # 2 touches 0 much but seldom; 3 touches 0 alone; 4 touches nothing and is nearest to 3

@@ -2,15 +2,15 @@ import numpy as np
 import pygltflib
 import pytest
 
-from geomocap.articulation.kinematics import JointMotion, body_motion
-from geomocap.articulation.model import SubjectModel, read_model, rotation_limits
-from geomocap.articulation.model_building import BodyCloud, build_model, key_poses
+from geomocap.bodies.motion_bodies import MotionBodiesSettings, find_motion_bodies
 from geomocap.errors import GeometryError
 from geomocap.export.run_export import export_run
-from geomocap.run import Run
-from geomocap.segmentation.motion_bodies import MotionBodiesSettings, find_motion_bodies
-from geomocap.segmentation.motion_paths import MotionPaths
+from geomocap.files.run import Run
+from geomocap.model.motion_paths import MotionPaths
+from geomocap.skeleton.kinematics import JointMotion, body_motion
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
+from geomocap.subject.model_building import BodyCloud, build_model, key_poses
+from geomocap.subject.subject_model import SubjectModel, read_model, rotation_limits
 from tests.geomocap.moving_chains import chain
 
 SPACING = 0.012
@@ -117,7 +117,7 @@ def test_a_model_moves_in_another_world_as_it_does_in_its_own(model):
 
 
 def skin(model):
-    return model.points, model.skin_bodies, model.skin_shares
+    return model.points, model.skin_bodies, model.skin_weights
 
 
 def broken(arrays, how):

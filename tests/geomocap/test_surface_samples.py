@@ -5,12 +5,12 @@ from scipy.optimize import least_squares
 from scipy.spatial.distance import squareform
 from scipy.spatial.transform import Rotation
 
-from geomocap.segmentation.connected_linkage import connected_linkage
-from geomocap.segmentation.local_rotations import local_rotations, turn_distances
-from geomocap.segmentation.motion_paths import sure_part
-from geomocap.segmentation.rigid_motions import fit_rigid_motion, turn_angles
-from geomocap.segmentation.skin_blending import explain
-from geomocap.segmentation.surface_graph import bridges, lasting_distances, surface_graph
+from geomocap.bodies.connected_linkage import connected_linkage
+from geomocap.bodies.local_rotations import local_rotations, turn_distances
+from geomocap.bodies.rigid_motions import fit_rigid_motion, turn_angles
+from geomocap.bodies.skin_blending import explain
+from geomocap.bodies.surface_graph import bridges, lasting_distances, surface_graph
+from geomocap.model.motion_paths import sure_part
 
 
 def test_lasting_distances_are_the_third_largest():
@@ -47,7 +47,7 @@ def test_local_rotations_and_their_distances_are_the_reference_ones():
             )[0].as_matrix()
             np.testing.assert_allclose(fitted[i, t], expected, atol=1e-5)
     angles = turn_angles(np.einsum("atij,btik->abtjk", fitted, fitted))
-    np.testing.assert_allclose(turn_distances(fitted, share=0.3), np.sort(angles, axis=2)[:, :, -2], atol=2e-3)
+    np.testing.assert_allclose(turn_distances(fitted, fraction=0.3), np.sort(angles, axis=2)[:, :, -2], atol=2e-3)
 
 
 def test_linkage_of_samples_that_are_all_neighbours_is_average_linkage():
@@ -84,35 +84,35 @@ def test_rigid_motion_is_steady_against_samples_that_do_not_follow():
 
 
 def seen_by_single_cameras(noise_along: float) -> tuple[np.ndarray, ...]:
-    """A turning body whose samples three cameras see, each one alone: true motion, positions, lines of sight."""
+    """A turning body whose samples three cameras see, each one alone: true motion, positions, rays."""
     rng = np.random.default_rng(8)
     rest = rng.normal(scale=0.1, size=(60, 3))
     true = Rotation.from_rotvec(rng.normal(scale=0.4, size=(6, 3))).as_matrix()
     positions = np.einsum("tij,nj->nti", true, rest) + 0.5
-    sight = np.repeat(np.eye(3)[np.arange(60) % 3][:, None], 6, axis=1)
-    off = rng.normal(scale=noise_along, size=(60, 6, 1)) * sight + rng.normal(scale=1e-3, size=(60, 6, 3))
-    return rest, true, positions + off, sight
+    ray = np.repeat(np.eye(3)[np.arange(60) % 3][:, None], 6, axis=1)
+    off = rng.normal(scale=noise_along, size=(60, 6, 1)) * ray + rng.normal(scale=1e-3, size=(60, 6, 3))
+    return rest, true, positions + off, ray
 
 
-def test_what_is_unsure_along_the_line_of_sight_does_not_turn_a_body():
-    rest, true, positions, sight = seen_by_single_cameras(0.02)
+def test_what_is_unsure_along_the_ray_does_not_turn_a_body():
+    rest, true, positions, ray = seen_by_single_cameras(0.02)
     weights = np.ones((60, 6))
     errors = []
-    for known in (None, sight):
-        rotations = fit_rigid_motion(positions, rest, weights, 1e-4, sight=known)[0]
+    for known in (None, ray):
+        rotations = fit_rigid_motion(positions, rest, weights, 1e-4, ray=known)[0]
         errors.append(np.rad2deg(turn_angles(rotations.swapaxes(1, 2) @ true)).mean())
     assert errors[1] < 0.35 * errors[0]
 
 
 def test_a_motion_with_lines_of_sight_is_the_least_squares_one():
-    rest, _, positions, sight = seen_by_single_cameras(0.02)
+    rest, _, positions, ray = seen_by_single_cameras(0.02)
     weights = np.random.default_rng(9).random((60, 6)) + 0.5
     least = 1e3  # residuals of this scale are all the same: no robust weights
-    rotations, translations, _ = fit_rigid_motion(positions, rest, weights, least, sight=sight)
+    rotations, translations, _ = fit_rigid_motion(positions, rest, weights, least, ray=ray)
 
     def misses(motion: np.ndarray) -> np.ndarray:
         carried = Rotation.from_rotvec(motion[:3]).apply(rest) + motion[3:]
-        return (np.sqrt(weights[:, 2, None]) * sure_part(carried - positions[:, 2], sight[:, 2])).ravel()
+        return (np.sqrt(weights[:, 2, None]) * sure_part(carried - positions[:, 2], ray[:, 2])).ravel()
 
     found = np.concatenate([Rotation.from_matrix(rotations[2]).as_rotvec(), translations[2]])
     np.testing.assert_allclose(found, least_squares(misses, np.zeros(6), xtol=1e-12).x, atol=1e-6)
@@ -124,25 +124,25 @@ def test_blends_with_lines_of_sight_are_those_of_a_search():
     translations = rng.normal(scale=0.1, size=(2, 5, 3))
     rest, weights = rng.random((3, 3)), rng.random((3, 5)) + 0.2
     carried = np.einsum("btij,nj->nbti", rotations, rest) + translations[None]
-    sight = rng.normal(size=(3, 5, 3))
-    sight /= np.linalg.norm(sight, axis=2, keepdims=True)
-    positions = 0.7 * carried[:, 0] + 0.3 * carried[:, 1] + rng.normal(scale=0.02, size=(3, 5, 1)) * sight
+    ray = rng.normal(size=(3, 5, 3))
+    ray /= np.linalg.norm(ray, axis=2, keepdims=True)
+    positions = 0.7 * carried[:, 0] + 0.3 * carried[:, 1] + rng.normal(scale=0.02, size=(3, 5, 1)) * ray
     everything = np.ones((3, 2), bool), np.ones((2, 2), bool)
-    of = (positions, weights, sight, rest)
+    of = (positions, weights, ray, rest)
     blends = explain(*of, np.ones(3, bool), rotations, translations, *everything, 0.01, 10.0)
     for i in range(3):
-        shares = np.linspace(0.5, 1.0, 2001)[:, None, None]
-        miss = sure_part(shares * carried[i, 0] + (1 - shares) * carried[i, 1] - positions[i], sight[i])
-        w = shares[:, 0, 0]
+        fractions = np.linspace(0.5, 1.0, 2001)[:, None, None]
+        miss = sure_part(fractions * carried[i, 0] + (1 - fractions) * carried[i, 1] - positions[i], ray[i])
+        w = fractions[:, 0, 0]
         costs = np.average((miss**2).sum(axis=2), weights=weights[i], axis=1) + 4 * w * (1 - w) * 1e-4
         assert blends.costs[i, 0] == pytest.approx(costs.min(), rel=1e-3)
-        assert blends.share[i, 0] == pytest.approx(w[costs.argmin()], abs=2e-3)
+        assert blends.fraction[i, 0] == pytest.approx(w[costs.argmin()], abs=2e-3)
     # a sample whose place at rest is open gets the one that fits best
     alone = explain(*of, np.zeros(3, bool), rotations, translations, *everything[:1], np.zeros((2, 2), bool), 0.0, 10.0)
 
     def misses(place: np.ndarray) -> np.ndarray:
         there = rotations[1] @ place + translations[1]
-        return (np.sqrt(weights[0] / weights[0].sum())[:, None] * sure_part(there - positions[0], sight[0])).ravel()
+        return (np.sqrt(weights[0] / weights[0].sum())[:, None] * sure_part(there - positions[0], ray[0])).ravel()
 
     assert alone.costs[0, 1] == pytest.approx(2.0 * least_squares(misses, rest[0], xtol=1e-12).cost, rel=1e-6)
 
@@ -174,7 +174,7 @@ def test_blends_are_those_of_a_search_over_weights():
         main = int(np.argmin(blends.costs[i]))
         assert main == min(best, key=lambda a: best[a])
         assert blends.costs[i, main] == pytest.approx(best[main][0], rel=1e-3, abs=1e-9)
-        assert blends.share[i, main] == pytest.approx(best[main][1], abs=2e-3)
+        assert blends.fraction[i, main] == pytest.approx(best[main][1], abs=2e-3)
 
 
 def test_bridges_are_the_relative_neighbours():

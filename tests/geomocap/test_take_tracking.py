@@ -2,24 +2,24 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geomocap.articulation.adjustment import adjust
-from geomocap.articulation.kinematics import BodyMotion, JointMotion, body_motion, posed, since
-from geomocap.articulation.model import SubjectModel, read_model, rotation_limits
-from geomocap.articulation.observations import Observations
-from geomocap.articulation.pose_search import find_pose
-from geomocap.articulation.smoothness import PosePrior
-from geomocap.articulation.surface_matching import FrameSurface, MatchingScales, ModelSurface, match_surfaces
-from geomocap.articulation.take_paths import attach_paths, turned_by_paths
-from geomocap.articulation.take_tracking import TakeSettings, track_take
+from geomocap.bodies.rigid_motions import turn_angles
 from geomocap.config import Config
 from geomocap.errors import GeometryError
+from geomocap.files.run import Run
+from geomocap.files.scans import open_scans
+from geomocap.model.motion_paths import MotionPaths
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.segmentation import segment
-from geomocap.run import Run
-from geomocap.scans import open_scans
+from geomocap.pipeline.segmentation_stage import segment
 from geomocap.scheduling import threads
-from geomocap.segmentation.motion_paths import MotionPaths
-from geomocap.segmentation.rigid_motions import turn_angles
+from geomocap.skeleton.articulated_adjustment import adjust
+from geomocap.skeleton.body_observations import Observations
+from geomocap.skeleton.kinematics import BodyMotion, JointMotion, body_motion, posed, since
+from geomocap.skeleton.motion_smoothness import PosePrior
+from geomocap.subject.model_following import FollowingSettings, follow_model
+from geomocap.subject.pose_search import find_pose
+from geomocap.subject.sequence_paths import attach_paths, turned_by_paths
+from geomocap.subject.subject_model import SubjectModel, read_model, rotation_limits
+from geomocap.subject.surface_matching import FrameSurface, MatchingScales, ModelSurface, match_surfaces
 
 SPACING = 0.015
 
@@ -53,7 +53,7 @@ def model():
     body = np.repeat(np.arange(3), [len(p) for p in parts])
     skin = np.zeros((len(points), 4), np.int32)
     skin[:, 0] = body
-    shares = np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1))
+    fractions = np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1))
     raised = np.tile(np.eye(3), (3, 1, 1))
     raised[1] = Rotation.from_rotvec([0.0, -0.6, 0.0]).as_matrix()
     poses = np.stack([np.tile(np.eye(3), (3, 1, 1)), raised])
@@ -62,7 +62,7 @@ def model():
         np.concatenate([outward(p, *s) for p, s in zip(parts, sizes, strict=True)]),
         np.zeros((0, 3), np.uint8),
         skin,
-        shares,
+        fractions,
         np.array([[0.12, 0.0, 0.5], [0.0, 0.0, 0.6]]),
         np.array([[0, 1], [0, 2]], np.int32),
         np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
@@ -88,7 +88,7 @@ def take_of(model, frames=12):
     local[:, 2] = Rotation.from_rotvec(np.outer(0.4 * np.sin(4 * time), [1.0, 0, 0])).as_matrix()
     root = np.array([1.0, -2.0, 0.4]) + np.outer(time, [0.3, 0.1, 0.0])
     bodies = body_motion(model.linkage, JointMotion(local, root))
-    return bodies, bodies.carry(model.points, model.skin_bodies, model.skin_shares)
+    return bodies, bodies.carry(model.points, model.skin_bodies, model.skin_weights)
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def tracked(model):
     true, places = take_of(model)
     rng = np.random.default_rng(0)
     shaken = places + rng.normal(0, 0.002, places.shape)
-    found = track_take(model, lambda t: (shaken[t], None), len(places), SPACING, 2)
+    found = follow_model(model, lambda t: (shaken[t], None), len(places), SPACING, 2)
     return true, places, found
 
 
@@ -106,7 +106,7 @@ def test_another_take_is_followed_from_another_place_and_pose(model, tracked):
     assert errors.mean() < 1.5 and errors.max() < 6.0
     joints = model.linkage.joint_positions(found.bodies)
     assert np.linalg.norm(joints - model.linkage.joint_positions(true), axis=2).max() < 0.015
-    assert found.distance.max() < 0.02 * model.extent
+    assert found.distance.max() < 0.02 * model.diagonal
 
 
 def test_hinge_of_the_model_stays_a_hinge(model, tracked):
@@ -118,7 +118,7 @@ def test_hinge_of_the_model_stays_a_hinge(model, tracked):
 
 def test_too_few_points_give_one_clear_line(model):
     with pytest.raises(GeometryError, match="frame 0: 3 points"):
-        track_take(model, lambda t: (np.eye(3), None), 2, SPACING, 2)
+        follow_model(model, lambda t: (np.eye(3), None), 2, SPACING, 2)
 
 
 def test_tracked_points_are_hung_on_the_model(model):
@@ -131,22 +131,22 @@ def test_tracked_points_are_hung_on_the_model(model):
 
 
 def unsure(places):
-    """Paths of some points that one camera sees: along its lines of sight they are wrong, more so higher up."""
+    """Paths of some points that one camera sees: along its rays they are wrong, more so higher up."""
     some = places[:, ::20].swapaxes(0, 1).copy()
     away = some - np.array([3.0, -3.5, 1.5])
-    sight = away / np.linalg.norm(away, axis=2, keepdims=True)
+    ray = away / np.linalg.norm(away, axis=2, keepdims=True)
     wrong = 0.15 * some[..., 2] * np.sin(1.3 * np.arange(len(places)))
-    return MotionPaths(some + wrong[..., None] * sight, sigma=np.full(some.shape[:2], 0.002), sight=sight)
+    return MotionPaths(some + wrong[..., None] * ray, sigma=np.full(some.shape[:2], 0.002), ray=ray)
 
 
 def test_depths_of_a_single_camera_do_not_draw_the_model_away(model):
     true, places = take_of(model)
-    found = track_take(model, lambda t: (places[t], None), len(places), SPACING, 2, unsure(places))
+    found = follow_model(model, lambda t: (places[t], None), len(places), SPACING, 2, unsure(places))
     apart = model.linkage.joint_positions(found.bodies) - model.linkage.joint_positions(true)
     assert np.linalg.norm(apart, axis=2).max() < 0.025  # of 0.11 if paths were as sure in depth
 
 
-def test_turns_are_seen_across_the_line_of_sight(model):
+def test_turns_are_seen_across_the_ray(model):
     true, places = take_of(model)
     paths = unsure(places)
     motion, bodies = rolled(model, true, 0.5 * np.sin(np.arange(len(places))))
@@ -197,9 +197,9 @@ def test_pose_prior_holds_what_nothing_is_seen_of(model):
     trunk = np.flatnonzero(model.skin.body == 0)
     seen = np.full((len(model.points), 4, 3), np.nan)
     seen[trunk] = places[:, trunk].swapaxes(0, 1)
-    sightings = Observations.of_paths(seen, np.full(seen.shape[:2], 0.01))
+    observations = Observations.of_paths(seen, np.full(seen.shape[:2], 0.01))
     prior = PosePrior(motion, 0.2, np.pi, 10.0)
-    found = adjust(linkage, motion, model.skin, sightings, pose_prior=prior, rounds=40, least_gain=1e-9)
+    found = adjust(linkage, motion, model.skin, observations, pose_prior=prior, rounds=40, least_gain=1e-9)
     np.testing.assert_allclose(found.bodies.rotations[:, 0], true.rotations[:, 0], atol=1e-3)
     np.testing.assert_allclose(found.motion.local[:, 1:], motion.local[:, 1:], atol=1e-6)
 
@@ -233,7 +233,7 @@ def test_model_in_another_rest_pose_moves_alike(model):
     true, places = take_of(model)
     again = model.reposed(true, 5)
     np.testing.assert_allclose(again.points, places[5], atol=1e-12)
-    carried = since(true, 5).carry(again.points, again.skin_bodies, again.skin_shares)
+    carried = since(true, 5).carry(again.points, again.skin_bodies, again.skin_weights)
     np.testing.assert_allclose(carried, places, atol=1e-9)
     np.testing.assert_allclose(again.joints, posed(model.linkage, true, 5).joints)
     pose = JointMotion(again.poses[1:], again.origin[None])
@@ -266,7 +266,7 @@ def test_limits_are_those_of_all_takes(model):
 def test_stage_follows_the_model_and_says_when_it_fits_poorly(model, tmp_path):
     _, places = take_of(model, 3)
     Run(tmp_path / "first").write_npz("model.npz", **model.arrays())
-    settings = Config(take=TakeSettings(rounds=1, steps=3, start_frames=1))
+    settings = Config(take=FollowingSettings(rounds=1, steps=3, start_frames=1))
     for name, scale in (("good", 1.0), ("large", 1.6)):
         np.savez(tmp_path / f"{name}.npz", points=scale * places)
         with threads(1) as executor:

@@ -5,9 +5,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from geomocap.segmentation.rotations import nearest_rotation
-from geomocap.tracking.companions import Companions
-from geomocap.tracking.patch_motion import carried, orthonormal
+from geomocap.model.rotations import nearest_rotation
+from geomocap.patches.companions import Companions
+from geomocap.patches.patch_prediction import carried, orthonormal
 
 RNG = np.random.default_rng(0)
 LIMB, TRUNK = 30, 30
@@ -85,7 +85,7 @@ def test_companions_are_those_that_moved_alike():
     spin = np.where(ON_LIMB[:, None], (0.0, 0.0, 1.5), 0.0)
     on_limb = dict(zip(IDENTITY.tolist(), ON_LIMB.tolist(), strict=True))
 
-    def own_share(turn):
+    def own_fraction(turn):
         motion = np.cross(turn, positions), turn
         found = Companions.none(N).met(np.arange(N), np.arange(N), IDENTITY, (positions, FRAMES), motion)
         same = [
@@ -93,8 +93,8 @@ def test_companions_are_those_that_moved_alike():
         ]
         return np.mean(same)
 
-    assert own_share(spin) > 0.9
-    assert own_share(np.zeros((N, 3))) < 0.7
+    assert own_fraction(spin) > 0.9
+    assert own_fraction(np.zeros((N, 3))) < 0.7
 
 
 def test_companions_stay_with_their_patches():

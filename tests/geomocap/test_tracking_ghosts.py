@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from geomocap.tracking.ghosts import nothing_behind
+from geomocap.patches.ghosts import nothing_behind
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
 
 VOXEL = 0.02

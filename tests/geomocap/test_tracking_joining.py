@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from geomocap.tracking.joining import join_broken
-from geomocap.tracking.trajectories import Trajectories
+from geomocap.model.trajectories import Trajectories
+from geomocap.trajectories.joining import join_broken
 
 T = 20
 TURN = Rotation.from_rotvec(np.outer(np.arange(T), [0.02, 0.05, -0.03])).as_matrix()

@@ -11,15 +11,15 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
-from geomocap.tracking.anchors import find_homes
-from geomocap.tracking.correspondences import Target, gather_pulls, pull
-from geomocap.tracking.deformation import block_pattern, normal_equations, rotation_of, solve_blocks, step, vector_of
-from geomocap.tracking.extremities import extremities, match_ends
-from geomocap.tracking.keyframes import most_open, openness
-from geomocap.tracking.node_graph import farthest_points, node_graph
-from geomocap.tracking.node_settings import NodeTrackingSettings
-from geomocap.tracking.nodes import track_nodes
-from geomocap.tracking.surface_points import PointSet, point_set, surface_graph
+from geomocap.nodes.anchors import find_homes
+from geomocap.nodes.correspondences import Target, gather_pulls, pull
+from geomocap.nodes.deformation import block_pattern, normal_equations, rotation_of, solve_blocks, step, vector_of
+from geomocap.nodes.extremities import extremities, match_ends
+from geomocap.nodes.keyframes import most_open, openness
+from geomocap.nodes.node_graph import farthest_points, node_graph
+from geomocap.nodes.node_settings import NodeTrackingSettings
+from geomocap.nodes.node_tracking import track_nodes
+from geomocap.nodes.surface_points import PointSet, point_set, surface_graph
 
 SMALL = NodeTrackingSettings(nodes=150, coarse_nodes=60, points=1200, coarse_points=800)
 
@@ -39,8 +39,8 @@ def capsule(count: int, length: float = 1.0, radius: float = 0.08, seed: int = 0
 
 def bend(p: np.ndarray, angle: float) -> np.ndarray:
     """Bend what lies at x > 0.5 about z by an angle, smoothly over 10 cm; lengths along the middle stay."""
-    share = np.clip((p[:, 0] - 0.45) / 0.1, 0, 1) * angle
-    R = Rotation.from_rotvec(np.column_stack([0 * share, 0 * share, share])).as_matrix()
+    fraction = np.clip((p[:, 0] - 0.45) / 0.1, 0, 1) * angle
+    R = Rotation.from_rotvec(np.column_stack([0 * fraction, 0 * fraction, fraction])).as_matrix()
     joint = np.array([0.5, 0, 0])
     return np.einsum("nij,nj->ni", R, p - joint) + joint
 

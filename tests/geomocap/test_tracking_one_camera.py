@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from geomocap.tracking.one_camera import image_precision
-from geomocap.tracking.patch_tracking import track_surface
-from geomocap.tracking.seeding import seed_for_one_camera
-from geomocap.tracking.tracking_settings import TrackingSettings
+from geomocap.patches.one_camera import image_precision
+from geomocap.patches.patch_settings import TrackingSettings
+from geomocap.patches.patch_tracking import track_surface
+from geomocap.patches.seeding import seed_for_one_camera
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
 
 FRAMES = 6

@@ -8,8 +8,8 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from geomocap.tracking.node_graph import NodeGraph
-from geomocap.tracking.part_selection import choose_parts, follow_bearings, touching, without_weakest
+from geomocap.nodes.node_graph import NodeGraph
+from geomocap.nodes.part_selection import choose_parts, follow_bearings, touching, without_weakest
 
 ALL_BESIDE = np.ones((3, 3), bool)
 NONE_REST = np.zeros(3, bool)

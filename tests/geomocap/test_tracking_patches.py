@@ -5,12 +5,13 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from geomocap.tracking.patch_kernel import align_patches
-from geomocap.tracking.patch_search import renewed
-from geomocap.tracking.patch_templates import inverse_diagonal
-from geomocap.tracking.patch_tracking import track_surface
-from geomocap.tracking.patches import Patches, align, doubted, with_templates
-from geomocap.tracking.seeding import (
+from geomocap.model.trajectories import REASONS
+from geomocap.patches.alignment_kernel import align_patches
+from geomocap.patches.patch_search import renewed
+from geomocap.patches.patch_settings import TrackingSettings
+from geomocap.patches.patch_templates import inverse_diagonal
+from geomocap.patches.patch_tracking import track_surface
+from geomocap.patches.seeding import (
     image_reduction,
     patch_radius,
     patch_shape,
@@ -19,8 +20,7 @@ from geomocap.tracking.seeding import (
     spread,
     surface_frames,
 )
-from geomocap.tracking.tracking_settings import TrackingSettings
-from geomocap.tracking.trajectories import REASONS
+from geomocap.patches.surface_patches import Patches, align, doubted, with_templates
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
 
 SETTINGS = TrackingSettings(n_patches=150, radius_px=4, seed_every=4)
@@ -238,8 +238,8 @@ def test_tracks_follow_the_true_surface(scene, views):
     assert set(tracks.reasons()) <= set(REASONS)
 
 
-@pytest.mark.parametrize(("templates", "share"), [("first", 0.0), ("updated", 0.5), ("previous", 1.0)])
-def test_templates_are_taken_again_as_asked(scene, views, seeds, templates, share):
+@pytest.mark.parametrize(("templates", "fraction"), [("first", 0.0), ("updated", 0.5), ("previous", 1.0)])
+def test_templates_are_taken_again_as_asked(scene, views, seeds, templates, fraction):
     X, Q = moved(scene, seeds, 1)
     every = np.arange(len(seeds))
     found = align(seeds, every, X, Q, seeds.has, views[1], iterations=(4, 8), least_correlation=0.6)
@@ -253,7 +253,7 @@ def test_templates_are_taken_again_as_asked(scene, views, seeds, templates, shar
     assert not taken[~good].any()
     if templates == "updated":
         assert not taken[every % 2 == 0].any()
-    assert abs(taken[good].mean() - share) < 0.1
+    assert abs(taken[good].mean() - fraction) < 0.1
 
 
 def test_a_patch_is_known_no_better_than_when_its_templates_were_taken(scene, views, seeds):

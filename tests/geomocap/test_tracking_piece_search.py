@@ -5,7 +5,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from geomocap.tracking.piece_search import fill_cells, rigid_motions, together
+from geomocap.patches.piece_search import fill_cells, rigid_motions, together
 
 
 def test_cells_know_the_nearest_place():

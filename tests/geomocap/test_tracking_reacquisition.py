@@ -3,11 +3,11 @@
 import numpy as np
 from numpy.testing import assert_allclose
 
-from geomocap.tracking.patch_search import hiding_depth
-from geomocap.tracking.patches import Patches, with_templates
-from geomocap.tracking.reacquisition import reacquire
-from geomocap.tracking.seeding import seed_patches, seed_spacing
-from geomocap.tracking.tracking_settings import TrackingSettings
+from geomocap.patches.patch_search import hiding_depth
+from geomocap.patches.patch_settings import TrackingSettings
+from geomocap.patches.reacquisition import reacquire
+from geomocap.patches.seeding import seed_patches, seed_spacing
+from geomocap.patches.surface_patches import Patches, with_templates
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
 
 SCENE = MovingEllipsoid(n_cameras=8, turn_deg=(0, 0, 45.0), shift=(0.0, 0.0, 0.0))

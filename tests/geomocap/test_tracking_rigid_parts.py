@@ -7,14 +7,14 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from geomocap.tracking.correspondences import Target
-from geomocap.tracking.node_graph import NodeGraph
-from geomocap.tracking.node_settings import NodeTrackingSettings
-from geomocap.tracking.nodes import track_nodes
-from geomocap.tracking.part_grouping import MotionForms, group_nodes, motion_of, twist_of
-from geomocap.tracking.part_motion import carry_samples, part_equations, part_motions
-from geomocap.tracking.rigid_parts import PartTracker
-from geomocap.tracking.surface_points import PointSet
+from geomocap.nodes.correspondences import Target
+from geomocap.nodes.node_graph import NodeGraph
+from geomocap.nodes.node_settings import NodeTrackingSettings
+from geomocap.nodes.node_tracking import track_nodes
+from geomocap.nodes.part_grouping import MotionForms, group_nodes, motion_of, twist_of
+from geomocap.nodes.part_motion import carry_samples, part_equations, part_motions
+from geomocap.nodes.rigid_parts import PartTracker
+from geomocap.nodes.surface_points import PointSet
 
 FRAMES = 9
 SMALL = NodeTrackingSettings(nodes=180, coarse_nodes=60, points=1500, coarse_points=800)

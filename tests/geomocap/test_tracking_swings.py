@@ -7,13 +7,13 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from geomocap.tracking.patch_search import hiding_depth
-from geomocap.tracking.patch_tracking import track_surface
-from geomocap.tracking.patches import Alignment
-from geomocap.tracking.piece_search import free_places, motion_of_piece
-from geomocap.tracking.seeding import seed_patches, seed_spacing
-from geomocap.tracking.swings import LostPiece, find_pieces, lost_pieces
-from geomocap.tracking.tracking_settings import TrackingSettings
+from geomocap.patches.patch_search import hiding_depth
+from geomocap.patches.patch_settings import TrackingSettings
+from geomocap.patches.patch_tracking import track_surface
+from geomocap.patches.piece_search import free_places, motion_of_piece
+from geomocap.patches.seeding import seed_patches, seed_spacing
+from geomocap.patches.surface_patches import PatchAlignment
+from geomocap.patches.swings import LostPiece, find_pieces, lost_pieces
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
 
 # 29 cm and 62 degrees from one frame to the next: nothing is where it was, and other cameras see it
@@ -90,7 +90,7 @@ def _found(patches, frame):
     N, C = patches.has.shape
     zeros = np.zeros(N)
     X, Q = patches.positions @ turn.T + shift, turn @ patches.frames
-    return Alignment(X, Q, zeros, zeros.astype(int), zeros, zeros, np.zeros((N, C)))
+    return PatchAlignment(X, Q, zeros, zeros.astype(int), zeros, zeros, np.zeros((N, C)))
 
 
 def test_a_piece_outside_the_silhouettes_is_looked_for_and_placed(views, spacing, seeds):

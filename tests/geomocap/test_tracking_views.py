@@ -5,11 +5,11 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.ndimage import binary_erosion
 
-from geomocap.carving.views import PinholeViews
+from geomocap.carving.silhouette_views import PinholeViews
 from geomocap.errors import GeometryError
-from geomocap.geometry import Voxels
-from geomocap.tracking.frame_views import FrameViews
-from geomocap.tracking.patch_motion import lift_flow
+from geomocap.model.frame_geometry import Voxels
+from geomocap.patches.frame_views import FrameViews
+from geomocap.patches.patch_prediction import lift_flow
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
 
 

@@ -3,9 +3,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from geomocap.errors import GeometryError
-from geomocap.tracking.filters import FilterSettings, departure, filter_trajectories
-from geomocap.tracking.smoothing import SmoothingSettings, noise_gain, smooth_motion
-from geomocap.tracking.trajectories import TOO_FAST, UNLIKE, Trajectories
+from geomocap.model.trajectories import TOO_FAST, UNLIKE, Trajectories
+from geomocap.trajectories.filters import FilterSettings, departure, filter_trajectories
+from geomocap.trajectories.smoothing import SmoothingSettings, noise_gain, smooth_motion
 from tests.geomocap.made_trajectories import join_tracks, make_tracks, rigid_tracks
 
 FPS = 30.0
@@ -37,7 +37,7 @@ def test_what_is_cleared_is_gone_and_only_there():
     assert tracks.lengths.tolist() == [4, 2]
     for values in (tracks.positions, tracks.rotations, tracks.sigma, tracks.correlation):
         assert np.isnan(values[drop]).all()
-    assert not tracks.n_views[drop].any() and not tracks.sight[drop].any()
+    assert not tracks.n_views[drop].any() and not tracks.ray[drop].any()
     assert_array_equal(tracks.positions[~drop], kept.positions[~drop])
     assert kept.lengths.tolist() == [4, 4]  # a selection is a copy
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geomocap.cameras import Rig
-from geomocap.triangulation import triangulate
+from geomocap.model.rig import Rig
+from geomocap.model.triangulation import triangulate
 from tests.geomocap.ball import ring
 
 

@@ -13,12 +13,12 @@ import open3d as o3d
 import pycolmap
 import pytest
 
-from geomocap.cameras import Rig
-from geomocap.capture import Capture, CaptureInfo, write_capture_info
-from geomocap.geometry import Voxels
-from geomocap.run import Run
-from viz.palette import body_colors
-from viz.views import look
+from geomocap.files.capture import Capture, CaptureInfo, write_capture_info
+from geomocap.files.run import Run
+from geomocap.model.frame_geometry import Voxels
+from geomocap.model.rig import Rig
+from viz.body_colors import body_colors
+from viz.viewpoints import look
 
 UP = np.array([0.0, 0.0, 1.0])
 # body, parent, joint relative to the parent's joint (m), limb from the joint (m), radius (m), swing (rad)

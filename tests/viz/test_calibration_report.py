@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from geomocap.calibration.calibrate import Calibration, calibrate_bar
-from geomocap.calibration.settings import BarSettings
+from geomocap.calibration.bar_calibration import Calibration, calibrate_bar
+from geomocap.calibration.calibration_settings import BarSettings
 from tests.geomocap.bar_scenes import eight_cameras, joined, knocked, seen, three_cameras
 from viz.calibration_report import write_calibration_report
 
@@ -19,10 +19,10 @@ def calibrations() -> list[Calibration]:
     out = []
     for scene in (three_cameras(4, 40), eight_cameras(4, 40)):
         rng = np.random.default_rng(0)
-        sightings = seen(scene, rng, 0.05)
+        observations = seen(scene, rng, 0.05)
         if len(scene.rig) == 3:
-            sightings = joined(sightings, seen(knocked(scene, 1, 2.0, 0.01), rng, 0.05), 20)
-        out.append(calibrate_bar(sightings, scene.length, BarSettings()))
+            observations = joined(observations, seen(knocked(scene, 1, 2.0, 0.01), rng, 0.05), 20)
+        out.append(calibrate_bar(observations, scene.length, BarSettings()))
     return out
 
 

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from geomocap.errors import GeomocapError, SettingsError
-from geomocap.export.errors import MissingPackageError
-from geomocap.pipeline.keypoints import keypoints, run_trajectories
-from geomocap.tracking.keypoint_file import KeyPoint, KeyPointFile, read_keypoints, write_keypoints
-from geomocap.tracking.keypoints import KeyPointPaths, Measured
+from geomocap.export.export_errors import MissingPackageError
+from geomocap.keypoints.keypoint_following import KeyPointPaths, Measured
+from geomocap.keypoints.keypoint_regions import KeyPoint, KeyPointFile, read_keypoints, write_keypoints
+from geomocap.pipeline.keypoint_stage import keypoints, run_trajectories
 from tests.viz.conftest import Figure, Made, make
 from viz.keypoint_editor import KeyPointEditor
 from viz.keypoint_marks import BRIDGED, MEASURED, Marks, marked

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from geomocap.errors import RunError
-from geomocap.run import Run
+from geomocap.files.run import Run
 from tests.viz.conftest import Made, make
 from viz import review
 from viz.keypoint_marks import BRIDGED, MEASURED

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from geomocap.errors import SettingsError
-from geomocap.tracking.keypoint_file import KeyPoint, KeyPointFile
-from geomocap.tracking.keypoints import Measured
+from geomocap.keypoints.keypoint_following import Measured
+from geomocap.keypoints.keypoint_regions import KeyPoint, KeyPointFile
 from tests.geomocap.made_trajectories import rigid_tracks
 from viz.keypoint_session import Follower, Session, pick_ball, pick_surface
 

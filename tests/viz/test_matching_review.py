@@ -8,13 +8,14 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from geomocap.cloud import CloudFrame, CloudSettings, cloud_of_frame, match_groups, undistorted_color
 from geomocap.config import load_config
+from geomocap.dense import CloudFrame, CloudSettings, cloud_of_frame, match_groups, undistorted_color
+from geomocap.files.run import Run
 from geomocap.pipeline import Job, clouds
-from geomocap.run import Run
 from geomocap.scheduling import threads
 from tests.geomocap.ball import RADIUS, Texture, photograph, ring
 from tests.geomocap.test_pipeline_clouds import COARSE, make_capture
+from viz.body_colors import ACCENT
 from viz.matching_review import (
     cloud_picture,
     cloud_sheet,
@@ -25,7 +26,6 @@ from viz.matching_review import (
     surface_errors,
     template_sheet,
 )
-from viz.palette import ACCENT
 from viz.review import review
 
 

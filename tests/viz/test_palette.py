@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from viz import palette
+from viz import body_colors as palette
 
 DEUTERANOPIA = np.array(
     [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
@@ -25,10 +25,10 @@ LAB = np.array(
 )
 
 
-def oklab(colors: np.ndarray, sight: np.ndarray) -> np.ndarray:
+def oklab(colors: np.ndarray, ray: np.ndarray) -> np.ndarray:
     c = np.asarray(colors) / 255
     linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-    return np.cbrt(np.clip(linear @ sight.T, 0, 1) @ LMS.T) @ LAB.T
+    return np.cbrt(np.clip(linear @ ray.T, 0, 1) @ LMS.T) @ LAB.T
 
 
 def test_colors_stay_what_they_are() -> None:
@@ -38,8 +38,8 @@ def test_colors_stay_what_they_are() -> None:
 
 def test_first_twelve_are_told_apart_by_normal_and_by_red_green_blind_sight() -> None:
     colors = np.array([palette.UNASSIGNED, *(palette.body_color(b) for b in range(12))])
-    for sight in (np.eye(3), DEUTERANOPIA):
-        lab = oklab(colors, sight)
+    for ray in (np.eye(3), DEUTERANOPIA):
+        lab = oklab(colors, ray)
         distance = np.linalg.norm(lab[:, None] - lab[None], axis=2) + np.eye(13)
         assert distance.min() > 0.07
 

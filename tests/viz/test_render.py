@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geomocap.cameras import Rig
+from geomocap.model.rig import Rig
 from viz.ray_kernels import mark_tiles, shade
-from viz.render import Layer, Look, Model, render
+from viz.rendering import Layer, Look, Model, render
 from viz.shapes import EMPTY, ball, ellipsoid, tube
-from viz.views import CameraView, PinholeView, Stage, camera_view, look, stage_of
+from viz.viewpoints import CameraView, PinholeView, ViewStage, camera_view, look, stage_of
 
 UP = np.array([0.0, 0.0, 1.0])
 PLAIN = Look(samples=4, outline=0, hollows=0)
@@ -26,7 +26,7 @@ def rig(params: list[float] | None = None) -> Rig:
 
 
 def cone_mask(view: CameraView, center: np.ndarray, radius: float) -> np.ndarray:
-    """Share of each pixel whose rays meet a sphere, from 8 × 8 rays a pixel."""
+    """Fraction of each pixel whose rays meet a sphere, from 8 × 8 rays a pixel."""
     width, height = view.size
     s = 8
     grid = np.stack(np.meshgrid((np.arange(width * s) + 0.5) / s, (np.arange(height * s) + 0.5) / s), axis=-1)
@@ -123,7 +123,7 @@ def test_something_behind_the_view_does_not_hide_what_is_in_front() -> None:
 def test_free_views_take_in_everything(azimuth: float, elevation: float, seed: int, wide: bool) -> None:
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(200, 3)) * ([2, 0.5, 1] if wide else [0.2, 0.3, 1.5])
-    stage = Stage(points, np.array([[5.0, -3.0, 1.0]]), UP, np.array([1.0, 0, 0]), 0.0)
+    stage = ViewStage(points, np.array([[5.0, -3.0, 1.0]]), UP, np.array([1.0, 0, 0]), 0.0)
     view = stage.view(azimuth, elevation, (200, 150))
     pixels, depth = view.project(points + stage.centers[0])
     assert (depth > 0).all()

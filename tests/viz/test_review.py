@@ -15,17 +15,17 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError, RunError
-from geomocap.run import Run
+from geomocap.files.run import Run
 from tests.viz.conftest import LIMBS, Made
 from viz import render_file, review, scene
 from viz.drawing import write_png
 from viz.figures import joint_angles
-from viz.quality import assess, coverage, relative_paths
+from viz.films import best_camera, motion_video, write_video
+from viz.quality_figures import assess, coverage, relative_paths
 from viz.report import Block, Report, Section, render_html, table, video
 from viz.results import Results, ply_count, read_points
 from viz.scene import stage
 from viz.sheets import overlay, path_sheet
-from viz.video import best_camera, motion_video, write_video
 
 
 @pytest.fixture(scope="session")
@@ -156,8 +156,8 @@ def test_results_read_what_was_written(made: Made) -> None:
 
 def test_overlay_lies_on_the_photographed_figure(made: Made) -> None:
     """The figure was drawn through the distorted cameras; its rendering must fall on the same pixels."""
-    from viz.palette import body_color
-    from viz.render import Model
+    from viz.body_colors import body_color
+    from viz.rendering import Model
     from viz.scene import body_skin
 
     results = Results(made.run, made.capture)
@@ -202,7 +202,7 @@ def test_coverage_notices_the_border(made: Made, tmp_path: Path) -> None:
     Image.fromarray(mask).save(file)
     found = coverage(Results(Run(tmp_path)))
     assert found is not None
-    assert found.share[0, 0] == pytest.approx(100 / 2400)
+    assert found.fraction[0, 0] == pytest.approx(100 / 2400)
     assert found.cut[0, 0]
 
 

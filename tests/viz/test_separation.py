@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geomocap.palette import body_colors
-from geomocap.run import Run
+from geomocap.files.run import Run
+from geomocap.model.palette import body_colors
 from tests.viz.conftest import LIMBS, Made
 from viz import review
 from viz.results import Results

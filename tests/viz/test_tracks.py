@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from geomocap.errors import RunError
-from geomocap.run import Run
+from geomocap.files.run import Run
 from tests.viz.conftest import Made
 from viz import review
 from viz.results import Results
 from viz.scene import stage
-from viz.tracks import filter_sheet, read_tracks, trajectory_sheet, velocity_sheet
+from viz.track_pictures import filter_sheet, read_tracks, trajectory_sheet, velocity_sheet
 
 FPS = 30.0
 RED = np.array([200, 30, 50])

@@ -1,0 +1,134 @@
+"""From too many bodies to those that are there: one after another goes that its neighbours explain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geomocap.bodies.body_criteria import Candidate, Criterion, judge, judge_softness
+from geomocap.bodies.body_model import BodyModel, Evidence, reassign, refit, settle_rest
+
+_FURTHER = 4  # steps beyond the criterion, as alternatives
+_LEAST_BODIES = 2
+
+
+@dataclass(frozen=True)
+class EliminationStep:
+    """One point of the elimination curve.
+
+    Attributes
+    ----------
+    bodies : int
+        Number of bodies before the step.
+    strength : float
+        Of the weakest of them: the criterion would have to be this many times itself for that body to go.
+    turn_deg, excess_deg : float
+        Of the weakest body.
+    label : (N,) int32
+        Body of each sample before the step.
+    """
+
+    bodies: int
+    strength: float
+    turn_deg: float
+    excess_deg: float
+    label: np.ndarray
+
+
+@dataclass(frozen=True)
+class Elimination:
+    """The bodies that are left, and how it came to them.
+
+    Attributes
+    ----------
+    model : BodyModel
+    evidence : Evidence
+        With places in the reference settled anew.
+    curve : tuple of EliminationStep
+        With a few steps beyond the criterion.
+    """
+
+    model: BodyModel
+    evidence: Evidence
+    curve: tuple[EliminationStep, ...]
+
+
+def eliminate(model: BodyModel, evidence: Evidence, criterion: Criterion, count: int | None) -> Elimination:
+    """Take away the weakest body until all are strong enough, or until a given number is left.
+
+    First by how bodies turn and what blends explain; among those that are left, by whether they are soft skin too.
+    """
+    curve: list[EliminationStep] = []
+    if count is None:
+        model, evidence = _weaken(model, evidence, criterion, judge, None, curve)
+    model, evidence = _weaken(model, evidence, criterion, judge_softness, count, curve)
+    further = max(_LEAST_BODIES, len(np.unique(model.label)) - _FURTHER)
+    _weaken(model, evidence, criterion, judge_softness, further, curve)
+    return Elimination(model.compact(), evidence, tuple(curve))
+
+
+def _weaken(
+    model: BodyModel,
+    evidence: Evidence,
+    criterion: Criterion,
+    judged_by: Callable[[int, BodyModel, Evidence, Criterion], Candidate],
+    count: int | None,
+    curve: list[EliminationStep],
+) -> tuple[BodyModel, Evidence]:
+    """Take away the weakest body, as the judge has it, until `count` are left or, without one, all are strong."""
+    known: dict[int, Candidate] = {}
+    while True:
+        bodies = np.unique(model.label).tolist()
+        known = {b: known[b] if b in known else judged_by(b, model, evidence, criterion) for b in bodies}
+        weakest = min(known.values(), key=lambda c: (c.strength, c.body))
+        if curve and curve[-1].bodies == len(bodies):  # judged anew
+            curve.pop()
+        turn_deg, excess_deg = float(np.rad2deg(weakest.turn)), float(np.rad2deg(weakest.excess))
+        label = np.unique(model.label, return_inverse=True)[1].astype(np.int32)
+        curve.append(EliminationStep(len(bodies), weakest.strength, turn_deg, excess_deg, label))
+        enough = weakest.strength >= 1.0 if count is None else len(bodies) <= count
+        if enough or len(bodies) == 1 or not np.isfinite(weakest.strength):
+            return model, evidence
+        before = model
+        model, evidence = remove(weakest, model, evidence)
+        for stale in _changed(before, model, evidence):
+            known.pop(stale, None)
+
+
+def _changed(before: BodyModel, after: BodyModel, evidence: Evidence) -> list[int]:
+    """Bodies that have other samples or another motion than before, and those that touch them."""
+    moved = before.label != after.label
+    changed = (before.rotations != after.rotations).any(axis=(1, 2, 3))
+    changed[before.label[moved]] = True
+    changed[after.label[moved]] = True
+    touching = (before.contacts(evidence.adjacency) + after.contacts(evidence.adjacency)) > 0
+    return np.flatnonzero(changed | touching[changed].any(axis=0)).tolist()
+
+
+def remove(candidate: Candidate, model: BodyModel, evidence: Evidence) -> tuple[BodyModel, Evidence]:
+    """Take a body away: its samples go to the neighbour that turns alike, or to blends of the neighbours."""
+    body = candidate.body
+    gone = np.flatnonzero(model.label == body)
+    label, partner, fraction = model.label.copy(), model.partner.copy(), model.fraction.copy()
+    if candidate.into >= 0:
+        label[gone], partner[gone], fraction[gone] = candidate.into, -1, 1.0
+        affected = np.array([candidate.into])
+    else:
+        reached = np.bincount(model.label[evidence.near[gone].indices], minlength=model.count) > 0
+        reached |= model.adjacent(evidence.adjacency)[body]
+        reached[body] = False
+        affected = np.flatnonzero(reached)
+        allowed = np.zeros((len(gone), model.count), bool)
+        allowed[:, affected] = True
+        any_pair = np.ones((model.count, model.count), bool)
+        blends = evidence.explain(gone, model, allowed, any_pair, evidence.penalty)
+        rows = np.arange(len(gone))
+        label[gone] = blends.costs.argmin(axis=1)
+        partner[gone], fraction[gone] = blends.partner[rows, label[gone]], blends.fraction[rows, label[gone]]
+    orphaned = partner == body
+    partner[orphaned], fraction[orphaned] = -1, 1.0
+    left = replace(model, label=label, partner=partner, fraction=fraction)
+    evidence = settle_rest(left, evidence)
+    return reassign(refit(left, evidence, affected), evidence, 1), evidence

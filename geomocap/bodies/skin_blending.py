@@ -1,0 +1,260 @@
+"""How samples follow one body or a blend of two: soft skin near a joint is no body of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from geomocap.model.motion_paths import DEPTH_FRACTION
+
+_BIG = 1e30
+
+
+@dataclass(frozen=True)
+class Blends:
+    """What each sample follows best.
+
+    Attributes
+    ----------
+    costs : (N, B) float, metres²
+        Least cost of explaining the sample with body b as the (main) one; infinite where not allowed.
+    partner : (N, B) int32
+        The second body of that explanation; -1: none, the body alone.
+    fraction : (N, B) float
+        Weight of the main body, 0.5 to 1.
+    """
+
+    costs: np.ndarray
+    partner: np.ndarray
+    fraction: np.ndarray
+
+
+@numba.njit(cache=True, nogil=True)
+def solve_symmetric(N, b, x):
+    """Solve N x = b for x (3,) by cofactors; N (3, 3) symmetric and positive definite, `x` may be `b`."""
+    xx, xy, xz = (
+        N[1, 1] * N[2, 2] - N[1, 2] * N[1, 2],
+        N[0, 2] * N[1, 2] - N[0, 1] * N[2, 2],
+        N[0, 1] * N[1, 2] - N[0, 2] * N[1, 1],
+    )
+    yy, yz, zz = (
+        N[0, 0] * N[2, 2] - N[0, 2] * N[0, 2],
+        N[0, 1] * N[0, 2] - N[0, 0] * N[1, 2],
+        N[0, 0] * N[1, 1] - N[0, 1] * N[0, 1],
+    )
+    determinant = N[0, 0] * xx + N[0, 1] * xy + N[0, 2] * xz
+    u, v, w = b[0] / determinant, b[1] / determinant, b[2] / determinant
+    x[0], x[1], x[2] = xx * u + xy * v + xz * w, xy * u + yy * v + yz * w, xz * u + yz * v + zz * w
+
+
+@numba.njit(cache=True, nogil=True)
+def _place_at_rest(positions, weights, total, ray, rotations, translations, place):
+    """Place of a sample at rest by one body's motion, least squares over the frames; weights sum to `total`."""
+    place[:] = 0.0
+    normal = np.zeros((3, 3))
+    away = np.empty(3)
+    direction = np.empty(3)
+    for t in range(len(weights)):
+        w = weights[t] / total
+        for c in range(3):
+            away[c] = positions[t, c] - translations[t, c]
+        if len(ray):
+            along = 0.0
+            for c in range(3):
+                along += (1.0 - DEPTH_FRACTION**2) * away[c] * ray[t, c]
+            for c in range(3):
+                away[c] -= along * ray[t, c]
+                direction[c] = 0.0
+                for d in range(3):
+                    direction[c] += rotations[t, d, c] * ray[t, d]
+            for c in range(3):
+                normal[c, c] += w
+                for d in range(3):
+                    normal[c, d] -= w * (1.0 - DEPTH_FRACTION**2) * direction[c] * direction[d]
+        for c in range(3):
+            for d in range(3):
+                place[d] += w * rotations[t, c, d] * away[c]
+    if len(ray):
+        solve_symmetric(normal, place, place)
+
+
+@numba.njit(cache=True, nogil=True)
+def _explain_one(
+    i,
+    positions,
+    weights,
+    ray,
+    rest,
+    certain,
+    rotations,
+    translations,
+    allowed,
+    adjacent,
+    penalty,
+    cap,
+    costs,
+    partner,
+    fraction,
+):
+    """Fill row i of the results of `_explain`."""
+    frames = weights.shape[1]
+    bodies = len(rotations)
+    sighted = ray.shape[1] > 0
+    total = 1e-12
+    for t in range(frames):
+        total += weights[i, t]
+    place = np.empty(3)
+    miss = np.empty((bodies, frames, 3))  # observed minus carried by the body
+    for b in range(bodies):
+        if not allowed[i, b]:
+            continue
+        if certain[i]:
+            for c in range(3):
+                place[c] = rest[i, c]
+        else:
+            _place_at_rest(positions[i], weights[i], total, ray[i], rotations[b], translations[b], place)
+        cost = 0.0
+        for t in range(frames):
+            square = 0.0
+            for c in range(3):
+                carried = translations[b, t, c]
+                for d in range(3):
+                    carried += rotations[b, t, c, d] * place[d]
+                miss[b, t, c] = positions[i, t, c] - carried
+            if sighted:
+                along = 0.0
+                for c in range(3):
+                    along += miss[b, t, c] * ray[i, t, c]
+                for c in range(3):
+                    miss[b, t, c] -= (1.0 - DEPTH_FRACTION) * along * ray[i, t, c]
+            for c in range(3):
+                square += miss[b, t, c] ** 2
+            cost += weights[i, t] * min(square, cap)
+        costs[i, b] = cost / total
+    for a in range(bodies):
+        if not allowed[i, a]:
+            continue
+        for b in range(a):
+            if not allowed[i, b] or not adjacent[a, b]:
+                continue
+            # observed = w carried_a + (1 - w) carried_b: linear in w
+            above, below = 0.0, 1e-18
+            for t in range(frames):
+                for c in range(3):
+                    difference = miss[b, t, c] - miss[a, t, c]
+                    above += weights[i, t] * miss[b, t, c] * difference
+                    below += weights[i, t] * difference * difference
+            # of w² below - 2 w above + constant + 4 w (1 - w) penalty: the least in [0, 1]
+            curve = below / total - 4.0 * penalty
+            if curve <= 1e-18:
+                continue
+            w = (above / total - 2.0 * penalty) / curve
+            if w <= 0.0 or w >= 1.0:
+                continue
+            cost = 0.0
+            for t in range(frames):
+                square = 0.0
+                for c in range(3):
+                    square += (w * miss[a, t, c] + (1.0 - w) * miss[b, t, c]) ** 2
+                cost += weights[i, t] * min(square, cap)
+            cost = cost / total + 4.0 * w * (1.0 - w) * penalty
+            main, other, part = (a, b, w) if w >= 0.5 else (b, a, 1.0 - w)
+            if cost < costs[i, main]:
+                costs[i, main] = cost
+                partner[i, main] = other
+                fraction[i, main] = part
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _explain(
+    positions,
+    weights,
+    ray,
+    rest,
+    certain,
+    rotations,
+    translations,
+    allowed,
+    adjacent,
+    penalty,
+    cap,
+    costs,
+    partner,
+    fraction,
+):
+    for i in numba.prange(len(weights)):
+        _explain_one(
+            np.int64(i),
+            positions,
+            weights,
+            ray,
+            rest,
+            certain,
+            rotations,
+            translations,
+            allowed,
+            adjacent,
+            penalty,
+            cap,
+            costs,
+            partner,
+            fraction,
+        )
+
+
+def explain(
+    positions: np.ndarray,
+    weights: np.ndarray,
+    ray: np.ndarray | None,
+    rest: np.ndarray,
+    certain: np.ndarray,
+    rotations: np.ndarray,
+    translations: np.ndarray,
+    allowed: np.ndarray,
+    adjacent: np.ndarray,
+    penalty: float,
+    cap: float,
+) -> Blends:
+    """Explain each sample by one body, or by a linear blend of two adjacent ones (linear blend skinning).
+
+    The cost is the mean squared residual plus 4 w (1 - w) penalty² for a blend of weights w and 1 - w.
+
+    Parameters
+    ----------
+    positions, weights : (N, T, 3) float, metres; (N, T) float
+    ray : (N, T, 3) float, optional
+        Directions along which positions are unsure, see `MotionPaths`.
+    rest : (N, 3) float, metres
+    certain : (N,) bool
+        Where `rest` is known; elsewhere each body may put the sample where it fits best.
+    rotations, translations : (B, T, 3, 3), (B, T, 3) float
+        Motions of the bodies since the reference.
+    allowed : (N, B) bool
+        Bodies that may explain a sample.
+    adjacent : (B, B) bool
+        Bodies that may blend; symmetric.
+    penalty : float, metres
+    cap : float, metres
+        Larger residuals of single frames count as this.
+    """
+    shape = (len(weights), len(rotations))
+    blends = Blends(np.full(shape, np.inf), np.full(shape, -1, np.int32), np.ones(shape))
+    _explain(
+        np.ascontiguousarray(positions),
+        weights,
+        np.zeros((len(weights), 0, 3)) if ray is None else np.ascontiguousarray(ray, float),
+        rest,
+        certain,
+        np.ascontiguousarray(rotations),
+        np.ascontiguousarray(translations),
+        allowed,
+        adjacent,
+        penalty**2,
+        cap**2,
+        blends.costs,
+        blends.partner,
+        blends.fraction,
+    )
+    return blends

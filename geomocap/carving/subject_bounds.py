@@ -1,0 +1,165 @@
+"""Where the subject can be: a box found from the cameras and the silhouettes of one frame.
+
+Cells are tested as whole boxes, not at their centres: a cell is dropped only if some camera is sure that nothing of the
+subject is in it. So nothing is missed, however small the subject is in the space between the cameras. Cells that are
+kept are halved until the subject is resolved.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from geomocap.carving.block_kernels import possible, summed
+from geomocap.carving.carving_settings import HullSettings
+from geomocap.carving.hull import heard, rounding_bounds
+from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.carving.voxel_grid import Grid
+from geomocap.errors import GeometryError
+
+CELLS = 48  # along the longest side of the subject, at least
+MAX_CELLS = 200_000  # no finer when there are this many
+MAX_LEVEL = 20
+SMALLEST_PART = 0.05  # of the cells of the largest connected part: smaller parts are false blobs
+
+
+def subject_box(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.ndarray] | None:
+    """Find the box round the subject of one frame.
+
+    Returns
+    -------
+    low, high : (3,) float, metres, world
+        Corners of the box; None instead of both if the silhouettes have no common volume.
+
+    Raises
+    ------
+    GeometryError
+        If the volume has no end: the cameras see the subject from one side only.
+    """
+    cells, origin, edge = subject_cells(views, settings)
+    if len(cells) == 0:
+        return None
+    return origin + cells.min(axis=0) * edge, origin + (cells.max(axis=0) + 1) * edge
+
+
+def subject_cells(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.ndarray, float]:
+    """Find the cells that may hold the subject, small separate parts left out; errors as of `subject_box`.
+
+    Returns
+    -------
+    cells : (N, 3) int64
+        Cell k reaches from origin + k · edge to origin + (k + 1) · edge.
+    origin : (3,) float, metres, world
+    edge : float, metres
+    """
+    tables = _tables(views, settings)
+    center, reach = focus(views)
+    for _ in range(10):
+        origin = center - reach
+        cells, level = np.zeros((1, 3), np.int64), 0
+        while level < MAX_LEVEL and 0 < len(cells) < MAX_CELLS:
+            cells, level = halve(views, settings, tables, cells, origin, 2 * reach / 2**level), level + 1
+            if len(cells) >= CELLS and np.ptp(cells, axis=0).max() + 1 >= CELLS:
+                label = _connected(cells)
+                sizes = np.bincount(label)
+                if np.ptp(cells[label == sizes.argmax()], axis=0).max() + 1 >= CELLS:
+                    cells = cells[(sizes >= SMALLEST_PART * sizes.max())[label]]
+                    break
+        if len(cells) == 0 or (cells.min() > 0 and cells.max() < 2**level - 1):
+            return cells, origin, 2 * reach / 2**level
+        reach *= 2  # the subject reaches the border of the space that was searched
+    raise GeometryError(
+        f"the silhouettes don't bound the subject: the volume common to {', '.join(views.names)} is more than "
+        f"{reach:.3g} m long; add a camera from another side or give carving.volume"
+    )
+
+
+def halve(
+    views: PinholeViews,
+    settings: HullSettings,
+    tables: tuple[np.ndarray, np.ndarray, np.ndarray, int],
+    cells: np.ndarray,
+    origin: np.ndarray,
+    edge: float,
+) -> np.ndarray:
+    """Divide cells of size `edge` into eight each and return those that may hold a point of the hull, (M, 3) int64."""
+    subject, seen, unseen, least = tables
+    parts = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    children = (2 * cells[:, None] + parts).reshape(-1, 3)
+    high = origin + (children.max(axis=0) + 1) * (edge / 2)
+    space = Grid(origin, float((high - origin).max()), (1, 1, 1))
+    keep = possible(
+        views.projections,
+        rounding_bounds(views, space),
+        subject,
+        seen,
+        unseen,
+        settings.tolerance,
+        least,
+        origin,
+        edge / 2,
+        children,
+    )
+    return children[keep]
+
+
+def _tables(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Integral images of the silhouettes and of what is seen, where the outside is unseen, cameras with a say."""
+    views, unseen, least = heard(views, settings)
+    subject = summed(views.masks)
+    return subject, summed(views.valid) if unseen.any() else subject, unseen, least
+
+
+def _connected(cells: np.ndarray) -> np.ndarray:
+    """Number the connected parts (26 neighbours) of cells (N, 3): labels (N,) int."""
+    side = np.int64(cells.max() + 3)
+    keys = ((cells[:, 0] + 1) * side + cells[:, 1] + 1) * side + cells[:, 2] + 1
+    order = np.argsort(keys)
+    keys = keys[order]
+    rows, columns = [], []
+    for step in ((a * side + b) * side + c for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1)):
+        if step > 0:
+            at = np.minimum(np.searchsorted(keys, keys + step), len(keys) - 1)
+            linked = np.flatnonzero(keys[at] == keys + step)
+            rows.append(order[linked])
+            columns.append(order[at[linked]])
+    row, column = np.concatenate(rows), np.concatenate(columns)
+    graph = coo_array((np.ones(len(row), np.int8), (row, column)), shape=(len(keys), len(keys)))
+    return connected_components(graph, directed=False)[1]
+
+
+def focus(views: PinholeViews) -> tuple[np.ndarray, float]:
+    """Find where the cameras look: the point nearest to all rays through the middles of the silhouettes.
+
+    Distances count linearly (iteratively reweighted least squares), so that one wrong camera doesn't matter.
+
+    Returns
+    -------
+    center : (3,) float, metres, world
+    reach : float
+        Distance of the farthest camera from it, metres.
+    """
+    centers, rays = [], []
+    for P, mask in zip(views.projections, views.masks, strict=True):
+        # how much of the silhouette each column and each row has
+        columns, rows = (cv2.reduce(mask, k, cv2.REDUCE_SUM, dtype=cv2.CV_32S).ravel() for k in (0, 1))
+        area = columns.sum()
+        u, v = (n @ np.arange(len(n)) / area if area else len(n) / 2 for n in (columns, rows))
+        inverse = np.linalg.inv(P[:, :3])
+        ray = inverse @ [u + 0.5, v + 0.5, 1.0]
+        centers.append(-inverse @ P[:, 3])
+        rays.append(ray / np.linalg.norm(ray))
+    C, D = np.array(centers), np.array(rays)
+    across = np.eye(3) - D[:, :, None] * D[:, None, :]
+    middle, scale = C.mean(axis=0), max(float(np.abs(C - C.mean(axis=0)).max()), 1e-6)
+    weights = np.ones(len(C))
+    point = middle
+    for _ in range(20):
+        A = np.einsum("c,cij->ij", weights, across) + 1e-9 * weights.sum() * np.eye(3)
+        b = np.einsum("c,cij,cj->i", weights, across, C - middle)
+        point = middle + np.linalg.solve(A, b)
+        distance = np.linalg.norm(np.einsum("cij,cj->ci", across, point - C), axis=1)
+        weights = 1.0 / np.maximum(distance, 1e-3 * scale)
+    return point, float(np.linalg.norm(C - point, axis=1).max())

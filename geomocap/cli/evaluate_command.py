@@ -1,0 +1,69 @@
+"""The command `geomocap evaluate`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.table import Table
+
+from geomocap.cli.execution import Workers
+from geomocap.cli.progress_bars import progress_bars
+from geomocap.cli.reports import console
+from geomocap.cli.settings_options import with_options_of
+from geomocap.evaluation import Evaluation, EvaluationSettings
+from geomocap.evaluation import evaluate as evaluate_run
+from geomocap.files.atomic import write_text
+from viz.evaluation_report import evaluation_report
+
+
+@with_options_of(EvaluationSettings)
+def evaluate(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")],
+    truth: Annotated[
+        Path, typer.Argument(metavar="TRUTH", help="Truth folder of a synthetic capture, or a .c3d, .trc or .bvh file.")
+    ],
+    settings: EvaluationSettings,
+    matches: Annotated[
+        Path | None,
+        typer.Option("--matches", metavar="FILE.toml", help='Pairs that belong together: joint = "marker".'),
+    ] = None,
+    unit: Annotated[Literal["m", "cm", "mm"], typer.Option("--unit", help="Unit of a BVH truth.")] = "m",
+    up: Annotated[
+        Literal["x", "y", "z"] | None,
+        typer.Option("--up", help="Axis of a motion file that points up."),
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option("--report", metavar="FILE.html", help="Page with plots and error pictures.")
+    ] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures as JSON.")] = None,
+    workers: Workers = None,
+) -> None:
+    """Compare a run with the truth: lengths in mm unless a name says otherwise, `%h` is per cent of the height.
+
+    Example: `geomocap evaluate RUN walk.c3d --align true --find_offset true --report evaluation.html`
+    """
+    with progress_bars() as progress:
+        result = evaluate_run(run, truth, settings, matches=matches, unit=unit, up=up, progress=progress)
+        if report is not None:
+            evaluation_report(report, result, run, truth, progress=progress)
+    for name, value in result.rounded().items():
+        console.print(f"{name}: {value}", markup=False)
+    _print_matches(result)
+    if json_file is not None:
+        write_text(json_file, json.dumps(result.rounded(), indent=1))
+    if report is not None:
+        console.print(f"report: {report}")
+
+
+def _print_matches(result: Evaluation) -> None:
+    if not result.matches:
+        return
+    table = Table("found", "true", "mean mm", "95 % mm", "frames", box=None, padding=(0, 2, 0, 0))
+    for column in table.columns[2:]:
+        column.justify = "right"
+    for m in sorted(result.matches, key=lambda m: m.mean_mm):
+        table.add_row(m.found, m.true, f"{m.mean_mm:.1f}", f"{m.p95_mm:.1f}", str(m.frames))
+    console.print(table)

@@ -1,0 +1,203 @@
+"""A run: the output folder, written whole file by whole file, that knows which of its stages are up to date.
+
+Every stage has a key, the digest of all its inputs, its settings and the code's version. The keys are kept in
+`RUN/.stages/`. A stage whose key has changed is cleared before it writes; one whose key is the same goes on from the
+files that are there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import threading
+import time
+import tomllib
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+import geomocap
+from geomocap.errors import RunError
+from geomocap.files.atomic import write_atomic, write_text
+
+
+@cache
+def code_version() -> str:
+    """The package's version with a digest of its sources, so that changed code never reuses old results."""
+    digest = hashlib.blake2b(digest_size=8)
+    for file in sorted(Path(geomocap.__file__).parent.rglob("*.py")):
+        digest.update(file.read_bytes())
+    return f"{geomocap.__version__}+{digest.hexdigest()}"
+
+
+def stage_key(*parts: Any) -> str:
+    """Digest of whatever a stage depends on (strings, numbers, settings dumped to dicts) and the code's version."""
+    text = json.dumps([code_version(), *parts], sort_keys=True, default=str)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder.
+
+    Attributes
+    ----------
+    path : Path
+        The folder; made when something is written.
+    """
+
+    path: Path
+    _timings_lock: threading.Lock = field(default_factory=threading.Lock, repr=False, compare=False)
+
+    def __getstate__(self) -> dict:
+        return {"path": self.path}
+
+    def __setstate__(self, state: dict) -> None:
+        object.__setattr__(self, "path", state["path"])
+        object.__setattr__(self, "_timings_lock", threading.Lock())
+
+    # --- files ---
+
+    def silhouette_file(self, camera: str, frame: int) -> Path:
+        """Path of a silhouette."""
+        return self.path / "silhouettes" / camera / f"{frame:06d}.png"
+
+    def frame_file(self, kind: str, frame: int) -> Path:
+        """Path of a frame's geometry; `kind` is voxels, cloud or bodies."""
+        return self.path / kind / f"{frame:06d}.ply"
+
+    def frames(self, kind: str) -> list[int]:
+        """Frame numbers of a kind of geometry that are there."""
+        return sorted(int(p.stem) for p in (self.path / kind).glob("[0-9]*.ply"))
+
+    def write_npz(self, name: str, **arrays: Any) -> None:
+        """Write an NPZ file of plain arrays, whole or not at all."""
+        for key, value in arrays.items():
+            if np.asarray(value).dtype == object:
+                raise RunError(f"{name}: {key} is no plain array")
+
+        def write(path: Path) -> None:
+            with path.open("wb") as file:
+                np.savez_compressed(file, **arrays)
+
+        write_atomic(self.path / name, write)
+
+    def read_npz(self, name: str, only: Collection[str] = ()) -> dict[str, np.ndarray]:
+        """Read an NPZ file of the run, never executing anything in it; of its arrays those named in `only`, if any are.
+
+        Raises
+        ------
+        RunError
+            If the file is missing or damaged.
+        """
+        file = self.path / name
+        try:
+            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
+                return {key: data[key] for key in data.files if not only or key in only}
+        except FileNotFoundError:
+            raise RunError(f"{file}: missing; run the stage that writes it") from None
+        except Exception as error:
+            raise RunError(f"{file}: damaged ({error}); delete it and run again") from None
+
+    # --- stages ---
+
+    def begin(self, stage: str, key: str, outputs: Sequence[str], optional: Sequence[str] = ()) -> None:
+        """Open a stage for writing: if its key has changed, delete what it wrote before and what was made from that.
+
+        Parameters
+        ----------
+        stage : str
+        key : str
+            From `stage_key`.
+        outputs : sequence of str
+            Files and folders of the run that the stage always writes.
+        optional : sequence of str
+            Those that it may write, or that others make from its outputs.
+        """
+        if self._state(stage).get("key") == key:
+            return
+        try:
+            for name in (*outputs, *optional):
+                target = self.path / name
+                if target.is_dir():
+                    shutil.rmtree(target)
+                else:
+                    target.unlink(missing_ok=True)
+        except OSError as error:
+            raise RunError(f"{self.path}: old results of {stage} can't be deleted ({error.strerror})") from None
+        self._write_state(stage, {"key": key, "done": False, "outputs": list(outputs)})
+
+    def finish(self, stage: str) -> None:
+        """Mark a stage as complete."""
+        self._write_state(stage, {**self._state(stage), "done": True})
+
+    def is_done(self, stage: str, key: str) -> bool:
+        """Whether the stage is complete with this key and all its outputs are still there."""
+        state = self._state(stage)
+        if state.get("key") != key or not state.get("done"):
+            return False
+        return all((self.path / name).exists() for name in state["outputs"])
+
+    def _state(self, stage: str) -> dict[str, Any]:
+        try:
+            return json.loads((self.path / ".stages" / f"{stage}.json").read_text())
+        except (OSError, ValueError):
+            return {}
+
+    def _write_state(self, stage: str, state: dict[str, Any]) -> None:
+        write_text(self.path / ".stages" / f"{stage}.json", json.dumps(state))
+
+    # --- records ---
+
+    def write_record(self, record: dict[str, Any]) -> None:
+        """Write `run.toml`: the configuration, the versions and the source."""
+        write_text(self.path / "run.toml", tomli_w.dumps(record))
+
+    def read_record(self) -> dict[str, Any]:
+        """Read `run.toml`.
+
+        Raises
+        ------
+        RunError
+            If the folder is no run.
+        """
+        file = self.path / "run.toml"
+        try:
+            return tomllib.loads(file.read_text(encoding="utf-8"))
+        except OSError:
+            raise RunError(f"{self.path}: no run folder, it has no run.toml") from None
+        except tomllib.TOMLDecodeError as error:
+            raise RunError(f"{file}: not valid TOML ({error})") from None
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[dict[str, int]]:
+        """Measure a stage into `timings.json`; set `items` of the yielded dict to what was worked on."""
+        count = {"items": 0}
+        start = time.perf_counter()
+        yield count
+        seconds = time.perf_counter() - start
+        if count["items"] == 0:
+            return
+        with self._timings_lock:
+            timings = self.read_timings()
+            rate = count["items"] / seconds if seconds > 0 else 0.0
+            timings[stage] = {
+                "seconds": round(seconds, 4),
+                "items": count["items"],
+                "items_per_second": round(rate, 3),
+            }
+            write_text(self.path / "timings.json", json.dumps(timings, indent=1))
+
+    def read_timings(self) -> dict[str, dict[str, float]]:
+        """Read `timings.json`; empty if there is none."""
+        try:
+            return json.loads((self.path / "timings.json").read_text())
+        except (OSError, ValueError):
+            return {}

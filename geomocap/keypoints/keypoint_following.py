@@ -1,0 +1,183 @@
+"""Key-points: points put anywhere on or in the subject, moved by the trajectories around them.
+
+A key-point is a centre and a radius at one frame. It moves with the trajectories inside (D'Apuzzo 2003: by their mean
+displacement); here by the rigid motion that fits them best, which is their mean displacement for a point amid them
+and right for one at their side. Each trajectory counts by how well it can tell where the point is: less if it is far
+(skin isn't rigid), if it came later, when the point's own place was no longer certain, and if it has moved otherwise
+before: an arm that swings past a hip has no say. So where none is measured inside, those of the body that the point
+sits on (within four radii) bridge the gap by themselves, and the frame is marked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geomocap.errors import GeometryError
+from geomocap.model.trajectories import Trajectories
+
+REACH = 4.0
+"""Radii within which trajectories bridge gaps."""
+
+_LEAST = 3  # trajectories inside that a frame needs not to be bridged; those that a turn needs
+_NOISE = 0.001  # m; what a trajectory drifts between frames that its stated precision doesn't know
+_SOFT = 0.15  # standard deviation of skin against a rigid body, fraction of the distance; steeper beyond the radius
+_MEMORY = 12.0  # weight of the largest misfit before in a trajectory's variance
+_ALIKE = 0.003  # m; largest shift within one frame, in the key-point's axes, of a trajectory that joins in
+_LOST = 0.5  # radii; standard deviation from which a key-point counts as lost
+_STEADY = 0.001  # m; how far points may be apart to determine a turn, against the last one
+
+
+@dataclass(frozen=True)
+class KeyPointPaths:
+    """Key-points through time.
+
+    Attributes
+    ----------
+    positions : (T, K, 3) float, metres, world
+        NaN where nothing near was measured.
+    bridged : (T, K) bool
+        Carried by the body round the point instead of the trajectories inside.
+    n_tracks : (T, K) int
+        Trajectories that it was moved by: those inside, where it is bridged those around.
+    std : (T, K) float, metres
+        Standard deviation of the place against that in the frame where it was put.
+    """
+
+    positions: np.ndarray
+    bridged: np.ndarray
+    n_tracks: np.ndarray
+    std: np.ndarray
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Trajectories frame by frame, as key-points read them.
+
+    Attributes
+    ----------
+    places : (T, N, 3) float, metres, world
+    variance : (T, N) float, metres²
+    """
+
+    places: np.ndarray
+    variance: np.ndarray
+
+    @classmethod
+    def of(cls, tracks: Trajectories) -> Measured:
+        """Arrange trajectories by frame; unknown precision counts as good."""
+        places = np.ascontiguousarray(tracks.positions.transpose(1, 0, 2))
+        return cls(places, np.nan_to_num(np.ascontiguousarray(tracks.sigma.T) ** 2, nan=0.0) + _NOISE**2)
+
+
+def follow_keypoints(
+    tracks: Trajectories | Measured, centers: np.ndarray, radii: np.ndarray, frame: int
+) -> KeyPointPaths:
+    """Follow key-points from one frame forward and backward.
+
+    Parameters
+    ----------
+    tracks : Trajectories or Measured
+    centers : (K, 3) float, metres, world
+        Places at `frame`.
+    radii : (K,) float, metres
+    frame : int
+
+    Raises
+    ------
+    GeometryError
+        If the frame doesn't exist or the arrays don't fit.
+    """
+    measured = tracks if isinstance(tracks, Measured) else Measured.of(tracks)
+    T = len(measured.places)
+    centers, radii = np.asarray(centers, float).reshape(-1, 3), np.asarray(radii, float).ravel()
+    if not 0 <= frame < T:
+        raise GeometryError(f"key-points are placed in frame {frame}, but there are frames 0 to {T - 1}")
+    if len(radii) != len(centers) or not (radii > 0).all():
+        raise GeometryError(f"{len(centers)} key-points and radii {radii.tolist()}: each needs a radius above 0 m")
+    K = len(centers)
+    paths = KeyPointPaths(
+        np.full((T, K, 3), np.nan), np.zeros((T, K), bool), np.zeros((T, K), int), np.full((T, K), np.nan)
+    )
+    for k in range(K):
+        for order in (range(frame, T), range(frame, -1, -1)):
+            _follow(measured, centers[k], float(radii[k]), order, paths, k)
+    return paths
+
+
+@dataclass(frozen=True)
+class _Pose:
+    """Where the key-point is in a frame: its axes and place in the world, and the variance of the place."""
+
+    turn: np.ndarray
+    place: np.ndarray
+    variance: float
+
+    def local(self, points: np.ndarray) -> np.ndarray:
+        """Return world points in the key-point's axes."""
+        return (points - self.place) @ self.turn
+
+
+def _follow(measured: Measured, center: np.ndarray, radius: float, order: range, paths: KeyPointPaths, k: int) -> None:
+    """Follow one key-point through the frames of `order`, the first of which it was placed in."""
+    N = measured.places.shape[1]
+    local = np.full((N, 3), np.nan)  # places of trajectories in the key-point's axes
+    joined = np.full(N, np.inf)  # variance of the key-point's place when they joined; infinite for those that haven't
+    misfit = np.zeros(N)  # largest so far, squared
+    pose = _Pose(np.eye(3), center, 0.0)
+    last: tuple[int, _Pose] | None = None
+    for t in order:
+        x = measured.places[t]
+        seen = np.isfinite(x[:, 0])
+        if last is None:
+            paths.std[t, k] = 0.0
+        else:
+            known = np.flatnonzero(seen & np.isfinite(joined))
+            if not len(known):
+                continue
+            a = local[known]
+            distance = np.linalg.norm(a, axis=1)
+            soft = (_SOFT * distance) ** 2 * (1 + (distance / radius) ** 2)
+            variance = measured.variance[t, known] + joined[known] + _MEMORY * misfit[known] + soft
+            moved, miss = _fit(a, x[known], variance, pose.turn)
+            if moved.variance > (_LOST * radius) ** 2:
+                continue
+            pose = moved
+            misfit[known] = np.maximum(misfit[known], miss**2)
+            inside = int((distance <= radius).sum())
+            paths.bridged[t, k] = inside < _LEAST
+            paths.n_tracks[t, k] = len(known) if inside < _LEAST else inside
+            paths.std[t, k] = np.sqrt(pose.variance)
+        paths.positions[t, k] = pose.place
+        distance = np.linalg.norm(x - pose.place, axis=1)
+        new = np.flatnonzero(seen & (distance <= REACH * radius) & np.isinf(joined))
+        if last is None:
+            inside = int((distance[new] <= radius).sum())
+            paths.bridged[t, k] = inside < _LEAST
+            paths.n_tracks[t, k] = len(new) if inside < _LEAST else inside
+        else:  # who moves alike joins in
+            shift = np.linalg.norm(pose.local(x[new]) - last[1].local(measured.places[last[0], new]), axis=1)
+            new = new[shift < _ALIKE]
+        local[new] = pose.local(x[new])
+        joined[new] = pose.variance
+        last = t, pose
+
+
+def _fit(local: np.ndarray, world: np.ndarray, variance: np.ndarray, last_turn: np.ndarray) -> tuple[_Pose, np.ndarray]:
+    """Fit world = R local + t robustly, and return it with the misfits (N,). With fewer than three points R stays."""
+    weight, turn = 1 / variance, last_turn
+    for _ in range(6):
+        total = weight.sum()
+        a, b = weight @ local / total, weight @ world / total
+        if len(local) >= _LEAST:
+            # the last turn steadies directions that the points hardly determine
+            spread = ((world - b) * weight[:, None]).T @ (local - a) + _STEADY**2 * total * last_turn
+            U, _, Vt = np.linalg.svd(spread)
+            turn = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        place = b - turn @ a
+        miss = np.linalg.norm(world - local @ turn.T - place, axis=1)
+        weight = 1 / (variance + miss**2)
+    # trajectories all on one side share what the skin between does
+    aside = float(np.linalg.norm(weight @ local)) / float(weight.sum())
+    return _Pose(turn, place, 1 / float(weight.sum()) + (_SOFT * aside) ** 2), miss

@@ -1,0 +1,1 @@
+"""The nouns: cameras, geometry, paths, ellipsoids, skeleton, surface. Values that know no files."""

@@ -1,0 +1,132 @@
+"""Trajectories: points of the surface through time, with gaps, precision, and why they ended."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from geomocap.errors import GeometryError
+
+REASONS = (
+    "followed to the last frame",
+    "seen by too few cameras",
+    "low correlation",
+    "low precision",
+    "apart from its neighbours",
+    "too fast",
+    "accelerated too much",
+    "unlike the motion around it",
+    "too short",
+    "outside the silhouettes",
+    "beside an older one",
+)
+"""Why a trajectory ends (or begins no earlier), by number."""
+
+LAST_FRAME, UNSEEN, LOW_CORRELATION, LOW_PRECISION, APART, TOO_FAST, TOO_JERKY, UNLIKE, TOO_SHORT, OUTSIDE, DOUBLE = (
+    range(11)
+)
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """N points over T frames.
+
+    Attributes
+    ----------
+    positions : (N, T, 3) float, metres, world
+        NaN where a point was not measured.
+    rotations : (N, T, 3, 3) float
+        Turn of the surface round the point since its first frame, world axes; NaN where not measured.
+    sigma : (N, T) float, metres
+        Standard deviation of a coordinate.
+    correlation : (N, T) float
+        Mean correlation over the cameras that saw it.
+    n_views : (N, T) int
+        Cameras that saw it, 0 where it was not measured.
+    ray : (N, T, 3) float
+        Unit vectors from the only camera that saw it, along which its depth is unsure; 0 where several did, or none.
+    normals : (N, 3) float
+        Outward normal of the surface in the frame `placed`.
+    placed : (N,) int
+        Frame in which the point was put on the surface; it is followed forward and backward from there.
+    end_reason, begin_reason : (N,) int
+        Why it was not followed further, forward and backward: number in `REASONS`.
+    """
+
+    positions: np.ndarray
+    rotations: np.ndarray
+    sigma: np.ndarray
+    correlation: np.ndarray
+    n_views: np.ndarray
+    ray: np.ndarray
+    normals: np.ndarray
+    placed: np.ndarray
+    end_reason: np.ndarray
+    begin_reason: np.ndarray
+
+    def __post_init__(self) -> None:
+        if self.positions.ndim != 3 or self.positions.shape[2] != 3:
+            raise GeometryError(f"trajectories: positions have shape {self.positions.shape}, expected (N, T, 3)")
+        N, T = self.positions.shape[:2]
+        shapes = {
+            "rotations": (N, T, 3, 3),
+            "sigma": (N, T),
+            "correlation": (N, T),
+            "n_views": (N, T),
+            "ray": (N, T, 3),
+            "normals": (N, 3),
+            "placed": (N,),
+            "end_reason": (N,),
+            "begin_reason": (N,),
+        }
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise GeometryError(f"trajectories: {name} has shape {getattr(self, name).shape}, expected {shape}")
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames T."""
+        return self.positions.shape[1]
+
+    @property
+    def measured(self) -> np.ndarray:
+        """Where points have a position, (N, T) bool."""
+        return np.isfinite(self.positions[:, :, 0])
+
+    @property
+    def start(self) -> np.ndarray:
+        """First frame with a position, (N,) int; T where there is none."""
+        found = self.measured
+        return np.where(found.any(axis=1), found.argmax(axis=1), self.n_frames)
+
+    @property
+    def end(self) -> np.ndarray:
+        """Last frame with a position, (N,) int; −1 where there is none."""
+        found = self.measured
+        return np.where(found.any(axis=1), self.n_frames - 1 - found[:, ::-1].argmax(axis=1), -1)
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """Number of frames with a position, (N,) int."""
+        return self.measured.sum(axis=1)
+
+    def select(self, which: np.ndarray) -> Trajectories:
+        """Return some of them, by a mask or by positions."""
+        return Trajectories(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
+
+    def clear(self, drop: np.ndarray) -> None:
+        """Take away, in place, what was measured where `drop` (N, T) is true."""
+        for values in (self.positions, self.rotations, self.sigma, self.correlation):
+            values[drop] = np.nan
+        for values in (self.n_views, self.ray):
+            values[drop] = 0
+
+    def reasons(self) -> dict[str, int]:
+        """Count why the trajectories end."""
+        found = Counter(int(r) for r in self.end_reason)
+        return {REASONS[r]: found[r] for r in sorted(found)}

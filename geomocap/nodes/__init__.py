@@ -1,0 +1,1 @@
+"""A deformable surface followed on geometry alone: nodes, and rigid parts made of them."""

@@ -1,0 +1,90 @@
+"""Trajectories known from elsewhere, such as patches of the images, as anchors that keep a surface from sliding."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from geomocap.nodes.node_graph import NodeGraph
+
+
+@dataclass(frozen=True)
+class AnchorPoints:
+    """Points of the surface whose places in a frame are known.
+
+    Attributes
+    ----------
+    sample : (K,) int
+        The graph's sample next to each.
+    offset : (K, 3) float, metres
+        From the mark to its sample, in the reference frame.
+    position : (K, 3) float, metres, world
+        Where the mark is in the frame.
+    """
+
+    sample: np.ndarray
+    offset: np.ndarray
+    position: np.ndarray
+
+    @classmethod
+    def of(cls, graph: NodeGraph, homes: np.ndarray, positions: np.ndarray) -> AnchorPoints:
+        """Hang marks on a graph.
+
+        Parameters
+        ----------
+        graph : NodeGraph
+        homes, positions : (P, 3) float, metres
+            In the reference frame and in the frame; NaN where not known.
+        """
+        known = np.isfinite(homes[:, 0]) & np.isfinite(positions[:, 0])
+        home = homes[known]
+        distance, sample = cKDTree(graph.samples).query(home)
+        near = distance < graph.spacing
+        sample = sample[near].astype(int)
+        return cls(sample, graph.samples[sample] - home[near], positions[known][near])
+
+    def add_to(
+        self, A: np.ndarray, b: np.ndarray, graph: NodeGraph, x: np.ndarray, R: np.ndarray, weight: float, scale: float
+    ) -> None:
+        """Add what the marks pull at the samples to A (S, 3, 3) and b (S, 3), in place; robustly, by Geman and McClure.
+
+        Parameters
+        ----------
+        x, R : (N, 3), (N, 3, 3) float
+            State of the nodes.
+        weight : float
+            Relative to that of a point.
+        scale : float
+            Distance at which a mark loses its weight, metres.
+        """
+        y, turn = carried(graph, self.sample, x, R)
+        error = y - self.position - np.einsum("kij,kj->ki", turn, self.offset)
+        w = weight / (1 + (error**2).sum(axis=1) / scale**2) ** 2
+        np.add.at(A, self.sample, w[:, None, None] * np.eye(3))
+        np.add.at(b, self.sample, w[:, None] * error)
+
+
+def carried(graph: NodeGraph, sample: np.ndarray, x: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places (K, 3) and turns (K, 3, 3) of some samples; the turns are blends and no exact rotations."""
+    w, nodes = graph.weights[sample], graph.binding[sample]
+    y = (w[..., None] * (x[nodes] + np.matmul(R[nodes], graph.offsets[sample][..., None])[..., 0])).sum(axis=1)
+    return y, (w[..., None, None] * R[nodes]).sum(axis=1)
+
+
+def find_homes(graph: NodeGraph, x: np.ndarray, R: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Where points at `positions` (P, 3) of a frame were in the reference frame (P, 3), metres.
+
+    Each is carried back by the sample next to it; NaN stays NaN, as does what is farther from the surface than half the
+    nodes' spacing.
+    """
+    homes = np.full(positions.shape, np.nan)
+    rows = np.flatnonzero(np.isfinite(positions[:, 0]))
+    if not len(rows):
+        return homes
+    distance, sample = cKDTree(graph.deform(x, R)[0]).query(positions[rows])
+    rows, sample = rows[distance < 0.5 * graph.spacing], sample[distance < 0.5 * graph.spacing].astype(int)
+    y, turn = carried(graph, sample, x, R)
+    homes[rows] = graph.samples[sample] + np.einsum("kji,kj->ki", turn, positions[rows] - y)
+    return homes

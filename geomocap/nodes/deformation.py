@@ -1,0 +1,306 @@
+"""Gauss–Newton steps of a deformation that is as rigid as possible, on nodes with 6 degrees of freedom.
+
+Energy, with nodes at x_i turned by R_i, reference positions p_i and samples y_s carried by their nodes:
+
+    E = Σ_ij w_ij |x_i − x_j − R_i (p_i − p_j)|²  +  Σ_s (y_s − q_s)ᵀ A_s (y_s − q_s)
+
+Sources: O. Sorkine, M. Alexa, "As-rigid-as-possible surface modeling", SGP 2007, equation 3; R. Sumner et al.,
+"Embedded deformation for shape manipulation", SIGGRAPH 2007, section 4. The normal equations are sparse with blocks of
+6 × 6 and are solved by conjugate gradients with their diagonal blocks as preconditioner.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from geomocap.nodes.node_graph import NodeGraph
+
+
+@dataclass(frozen=True)
+class BlockPattern:
+    """Where the 6 × 6 blocks of the normal equations stand.
+
+    Attributes
+    ----------
+    start : (N + 1,) int
+        First block of each row.
+    column : (B,) int
+    diagonal : (N,) int
+        Block of each node with itself.
+    of_edges : (E, 2) int
+        Blocks (i, j) and (j, i) of each edge.
+    of_samples : (S, K, K) int
+        Blocks of each pair of a sample's nodes.
+    """
+
+    start: np.ndarray
+    column: np.ndarray
+    diagonal: np.ndarray
+    of_edges: np.ndarray
+    of_samples: np.ndarray
+
+
+def block_pattern(graph: NodeGraph) -> BlockPattern:
+    """Lay out the normal equations of a graph."""
+    N = len(graph.nodes)
+    i, j = graph.edges.T
+    # pairs of nodes of which one carries nothing may be no edge; they get blocks all the same
+    a, b = graph.binding[:, :, None], graph.binding[:, None, :]
+    shared = (a * N + b).ravel()
+    keys = np.unique(np.concatenate([i * N + j, j * N + i, np.arange(N) * (N + 1), shared]))
+    row, column = keys // N, keys % N
+    start = np.searchsorted(row, np.arange(N + 1))
+    return BlockPattern(
+        start,
+        column,
+        np.searchsorted(keys, np.arange(N) * (N + 1)),
+        np.searchsorted(keys, np.column_stack([i * N + j, j * N + i])),
+        np.searchsorted(keys, a * N + b),
+    )
+
+
+@njit(cache=True, nogil=True)
+def normal_equations(
+    x, R, nodes, edges, edge_weights, binding, weights, offsets, A, b, diagonal, of_edges, of_samples, n_blocks
+):
+    """Blocks H (B, 6, 6) and right side g (N, 6) of the step (turn, shift) of each node.
+
+    Parameters
+    ----------
+    x, R : (N, 3), (N, 3, 3) float
+        State of the nodes.
+    nodes : (N, 3) float
+        Reference positions.
+    edge_weights : (E,) float
+    A : (S, 3, 3) float
+        Weights of the samples' positions.
+    b : (S, 3) float
+        A times the sample's error.
+    """
+    N = len(x)
+    S, K = binding.shape
+    H = np.zeros((n_blocks, 6, 6))
+    g = np.zeros((N, 6))
+    for e in range(len(edges)):
+        w = edge_weights[e]
+        if w == 0:
+            continue
+        for side in range(2):
+            i, j = edges[e, side], edges[e, 1 - side]
+            bi, bj = diagonal[i], diagonal[j]
+            bij, bji = of_edges[e, side], of_edges[e, 1 - side]
+            d0, d1, d2 = nodes[i, 0] - nodes[j, 0], nodes[i, 1] - nodes[j, 1], nodes[i, 2] - nodes[j, 2]
+            a0 = R[i, 0, 0] * d0 + R[i, 0, 1] * d1 + R[i, 0, 2] * d2
+            a1 = R[i, 1, 0] * d0 + R[i, 1, 1] * d1 + R[i, 1, 2] * d2
+            a2 = R[i, 2, 0] * d0 + R[i, 2, 1] * d1 + R[i, 2, 2] * d2
+            r0, r1, r2 = x[i, 0] - x[j, 0] - a0, x[i, 1] - x[j, 1] - a1, x[i, 2] - x[j, 2] - a2
+            # residual r; dr/dturn_i = [a]ₓ, dr/dshift_i = 1, dr/dshift_j = −1
+            q = a0 * a0 + a1 * a1 + a2 * a2
+            av = (a0, a1, a2)
+            for m in range(3):
+                for n in range(3):
+                    H[bi, m, n] -= w * av[m] * av[n]
+                H[bi, m, m] += w * q
+                H[bi, 3 + m, 3 + m] += w
+                H[bj, 3 + m, 3 + m] += w
+                H[bij, 3 + m, 3 + m] -= w
+                H[bji, 3 + m, 3 + m] -= w
+            # [a]ₓᵀ = −[a]ₓ stands between turn and shift
+            c01, c02, c12 = w * a2, -w * a1, w * a0
+            H[bi, 0, 4] += c01
+            H[bi, 1, 3] -= c01
+            H[bi, 0, 5] += c02
+            H[bi, 2, 3] -= c02
+            H[bi, 1, 5] += c12
+            H[bi, 2, 4] -= c12
+            H[bi, 4, 0] += c01
+            H[bi, 3, 1] -= c01
+            H[bi, 5, 0] += c02
+            H[bi, 3, 2] -= c02
+            H[bi, 5, 1] += c12
+            H[bi, 4, 2] -= c12
+            H[bij, 0, 4] -= c01
+            H[bij, 1, 3] += c01
+            H[bij, 0, 5] -= c02
+            H[bij, 2, 3] += c02
+            H[bij, 1, 5] -= c12
+            H[bij, 2, 4] += c12
+            H[bji, 4, 0] -= c01
+            H[bji, 3, 1] += c01
+            H[bji, 5, 0] -= c02
+            H[bji, 3, 2] += c02
+            H[bji, 5, 1] -= c12
+            H[bji, 4, 2] += c12
+            g[i, 0] -= c01 * r1 + c02 * r2
+            g[i, 1] -= -c01 * r0 + c12 * r2
+            g[i, 2] -= -c02 * r0 - c12 * r1
+            g[i, 3] -= w * r0
+            g[i, 4] -= w * r1
+            g[i, 5] -= w * r2
+            g[j, 3] += w * r0
+            g[j, 4] += w * r1
+            g[j, 5] += w * r2
+    J = np.zeros((K, 3, 6))
+    AJ = np.zeros((K, 3, 6))
+    for s in range(S):
+        if A[s, 0, 0] + A[s, 1, 1] + A[s, 2, 2] == 0:
+            continue
+        for k in range(K):
+            i = binding[s, k]
+            w = weights[s, k]
+            o = offsets[s, k]
+            a0 = w * (R[i, 0, 0] * o[0] + R[i, 0, 1] * o[1] + R[i, 0, 2] * o[2])
+            a1 = w * (R[i, 1, 0] * o[0] + R[i, 1, 1] * o[1] + R[i, 1, 2] * o[2])
+            a2 = w * (R[i, 2, 0] * o[0] + R[i, 2, 1] * o[1] + R[i, 2, 2] * o[2])
+            # dy/dturn = −[a]ₓ, dy/dshift = w
+            J[k, 0, 1], J[k, 0, 2] = a2, -a1
+            J[k, 1, 0], J[k, 1, 2] = -a2, a0
+            J[k, 2, 0], J[k, 2, 1] = a1, -a0
+            J[k, 0, 3] = J[k, 1, 4] = J[k, 2, 5] = w
+            for m in range(3):
+                for n in range(6):
+                    AJ[k, m, n] = A[s, m, 0] * J[k, 0, n] + A[s, m, 1] * J[k, 1, n] + A[s, m, 2] * J[k, 2, n]
+        for k in range(K):
+            i = binding[s, k]
+            for m in range(6):
+                g[i, m] -= J[k, 0, m] * b[s, 0] + J[k, 1, m] * b[s, 1] + J[k, 2, m] * b[s, 2]
+            for h in range(K):
+                block = of_samples[s, k, h]
+                for m in range(6):
+                    for n in range(6):
+                        H[block, m, n] += J[k, 0, m] * AJ[h, 0, n] + J[k, 1, m] * AJ[h, 1, n] + J[k, 2, m] * AJ[h, 2, n]
+    return H, g
+
+
+@njit(cache=True, nogil=True)
+def solve_blocks(H, g, start, column, diagonal, iterations, tolerance):
+    """Solve H z = g by conjugate gradients with block-diagonal preconditioner; returns z (N, 6).
+
+    Stops when the preconditioned residual has fallen by `tolerance`, or after `iterations`.
+    """
+    N = len(g)
+    P = np.zeros((N, 6, 6))
+    for i in range(N):
+        P[i] = np.linalg.inv(H[diagonal[i]])
+    z = np.zeros((N, 6))
+    r = g.copy()
+    u = np.zeros((N, 6))
+    q = np.zeros((N, 6))
+    rho = 0.0
+    for i in range(N):
+        for m in range(6):
+            s = 0.0
+            for n in range(6):
+                s += P[i, m, n] * r[i, n]
+            u[i, m] = s
+            rho += s * r[i, m]
+    rho0 = rho
+    if rho0 <= 0:
+        return z
+    for _ in range(iterations):
+        pq = 0.0
+        for i in range(N):
+            q0 = q1 = q2 = q3 = q4 = q5 = 0.0
+            for k in range(start[i], start[i + 1]):
+                v = u[column[k]]
+                B = H[k]
+                for n in range(6):
+                    vn = v[n]
+                    q0 += B[0, n] * vn
+                    q1 += B[1, n] * vn
+                    q2 += B[2, n] * vn
+                    q3 += B[3, n] * vn
+                    q4 += B[4, n] * vn
+                    q5 += B[5, n] * vn
+            q[i, 0], q[i, 1], q[i, 2], q[i, 3], q[i, 4], q[i, 5] = q0, q1, q2, q3, q4, q5
+            pq += u[i, 0] * q0 + u[i, 1] * q1 + u[i, 2] * q2 + u[i, 3] * q3 + u[i, 4] * q4 + u[i, 5] * q5
+        alpha = rho / pq
+        new = 0.0
+        for i in range(N):
+            for m in range(6):
+                z[i, m] += alpha * u[i, m]
+                r[i, m] -= alpha * q[i, m]
+        for i in range(N):
+            for m in range(6):
+                s = 0.0
+                for n in range(6):
+                    s += P[i, m, n] * r[i, n]
+                q[i, m] = s
+                new += s * r[i, m]
+        if new < tolerance * tolerance * rho0:
+            break
+        beta = new / rho
+        rho = new
+        for i in range(N):
+            for m in range(6):
+                u[i, m] = q[i, m] + beta * u[i, m]
+    return z
+
+
+def rotation_of(turn: np.ndarray) -> np.ndarray:
+    """Rotation matrices (N, 3, 3) of rotation vectors (N, 3), radians (Rodrigues)."""
+    angle = np.linalg.norm(turn, axis=1)
+    axis = turn / np.maximum(angle, 1e-12)[:, None]
+    K = np.zeros((len(turn), 3, 3))
+    K[:, 0, 1], K[:, 0, 2], K[:, 1, 2] = -axis[:, 2], axis[:, 1], -axis[:, 0]
+    K -= K.transpose(0, 2, 1)
+    s, c = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
+    return np.eye(3) + s * K + (1 - c) * (K @ K)
+
+
+def vector_of(R: np.ndarray) -> np.ndarray:
+    """Rotation vectors (N, 3), radians, of rotation matrices (N, 3, 3); exact but for turns near 180°."""
+    w = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1) / 2
+    sine = np.linalg.norm(w, axis=1)
+    angle = np.arctan2(sine, (np.trace(R, axis1=1, axis2=2) - 1) / 2)
+    return w * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 1.0)[:, None]
+
+
+def step(
+    graph: NodeGraph,
+    pattern: BlockPattern,
+    x: np.ndarray,
+    R: np.ndarray,
+    edge_weights: np.ndarray,
+    A: np.ndarray,
+    b: np.ndarray,
+    iterations: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """One Gauss–Newton step; returns the nodes' new positions (N, 3) and rotations (N, 3, 3).
+
+    Parameters
+    ----------
+    edge_weights : (E,) float
+    A, b : (S, 3, 3), (S, 3) float
+        Samples' weights, and weights times errors.
+    iterations : int
+        Of the conjugate gradients, at most.
+    """
+    H, g = normal_equations(
+        x,
+        R,
+        graph.nodes,
+        graph.edges,
+        edge_weights,
+        graph.binding,
+        graph.weights,
+        graph.offsets,
+        A,
+        b,
+        pattern.diagonal,
+        pattern.of_edges,
+        pattern.of_samples,
+        len(pattern.column),
+    )
+    # a little damping keeps nodes in place that nothing holds
+    size = graph.spacing**2
+    for m in range(6):
+        H[pattern.diagonal, m, m] += 1e-4 * (size if m < 3 else 1.0)
+    z = solve_blocks(H, g, pattern.start, pattern.column, pattern.diagonal, iterations, 1e-3)
+    turn = z[:, :3]
+    # no node turns by more than half a radian in one step: the linearisation ends there
+    much = np.maximum(np.linalg.norm(turn, axis=1, keepdims=True) / 0.5, 1.0)
+    return x + z[:, 3:], rotation_of(turn / much) @ R

@@ -1,0 +1,64 @@
+"""How well the points of a frame hold each node, direction by direction."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix
+
+from geomocap.nodes.node_graph import NodeGraph
+
+
+def patch_mean(graph: NodeGraph, rounds: int = 2) -> csr_matrix:
+    """Matrix (N, S) that averages what samples know over the patch around each node, rows summing to 1.
+
+    A sample counts for the nodes that carry it, and then for their neighbours, `rounds` edges far.
+    """
+    N, (S, K) = len(graph.nodes), graph.binding.shape
+    own = coo_matrix((graph.weights.ravel(), (graph.binding.ravel(), np.repeat(np.arange(S), K))), (N, S)).tocsr()
+    i, j = graph.edges.T
+    ones = np.ones(len(i))
+    near = coo_matrix((ones, (i, j)), (N, N)).tocsr()
+    near = near + near.T + coo_matrix((np.ones(N), (np.arange(N), np.arange(N))), (N, N)).tocsr()
+    mean = own
+    for _ in range(rounds):
+        mean = near @ mean
+    total = np.asarray(mean.sum(axis=1)).ravel()
+    return csr_matrix(coo_matrix((1 / np.maximum(total, 1e-12), (np.arange(N), np.arange(N))), (N, N)) @ mean)
+
+
+def node_covariance(
+    mean: csr_matrix,
+    normals: np.ndarray,
+    weight: np.ndarray,
+    across: np.ndarray,
+    slide: float,
+    floor: float,
+    anchored: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance of each node's position (N, 3, 3), m², and the support of its patch (N,), 0 to 1.
+
+    A patch is held along its normals: a plane in one direction, a limb in two, an end of a limb in all three. What is
+    left is free to slide, with standard deviation `slide`.
+
+    Parameters
+    ----------
+    mean : (N, S) sparse
+        From `patch_mean`.
+    normals : (S, 3) float
+        Of the samples as they lie in the frame.
+    weight : (S,) float
+        How well points support each sample, 0 to 1.
+    across : (S,) float
+        Distance of each sample to the plane of its point, metres.
+    slide, floor : float
+        Standard deviation of an unseen sliding, and the least of any direction, metres.
+    anchored : (S,) float, optional
+        Number of anchors at each sample; they hold it in all directions.
+    """
+    support = mean @ weight
+    held = mean @ (weight[:, None] * (normals[:, :, None] * normals[:, None, :]).reshape(-1, 9))
+    variance = (mean @ (weight * across**2)) / np.maximum(support, 1e-6) + floor**2
+    information = held.reshape(-1, 3, 3) / variance[:, None, None] + np.eye(3) / slide**2
+    if anchored is not None:
+        information += (mean @ anchored / variance)[:, None, None] * np.eye(3)
+    return np.linalg.inv(information), support

@@ -1,0 +1,1 @@
+"""Surface patches followed in the images of all cameras that see them."""

@@ -1,0 +1,318 @@
+"""Patches of the surface: small curved pieces with a place, a shape and a template in each camera that saw them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from geomocap.patches.alignment_kernel import align_patches
+from geomocap.patches.frame_views import FrameViews
+from geomocap.patches.patch_templates import take_templates
+
+_COARSE_STRIDE = 2  # of the samples, on blurred levels
+_OWN = ("positions", "frames", "shape", "size", "rows", "has", "hidden", "doubt")
+
+
+@dataclass(frozen=True)
+class PatchAlignment:
+    """What aligning patches with a frame found; leading axis N patches.
+
+    Attributes
+    ----------
+    positions : (N, 3) float, metres, world
+    frames : (N, 3, 3) float
+        World from patch frame, rotations.
+    correlation : (N,) float
+        Mean over the cameras used, −1 without any.
+    n_views : (N,) int
+        Cameras whose correlation is good enough.
+    sigma : (N,) float
+        Standard deviation of a coordinate, metres: root mean square of the three axes; inf without solution.
+    image_sigma : (N,) float
+        The same without the depth where a single camera sees the patch.
+    by_camera : (N, C) float
+        Correlation in each camera, −1 where it has no part.
+    """
+
+    positions: np.ndarray
+    frames: np.ndarray
+    correlation: np.ndarray
+    n_views: np.ndarray
+    sigma: np.ndarray
+    image_sigma: np.ndarray
+    by_camera: np.ndarray
+
+    def replaced(self, where: np.ndarray, other: PatchAlignment) -> PatchAlignment:
+        """Return this alignment with that of `other` at some patches, (N,) bool."""
+        parts = {}
+        for field in fields(self):
+            mine, new = getattr(self, field.name), getattr(other, field.name)
+            parts[field.name] = np.where(where.reshape((-1,) + (1,) * (mine.ndim - 1)), new, mine)
+        return PatchAlignment(**parts)
+
+    def at(self, positions: np.ndarray, frames: np.ndarray) -> PatchAlignment:
+        """Return it at other places."""
+        return replace(self, positions=positions, frames=frames)
+
+    def spread(self, which: np.ndarray, positions: np.ndarray, frames: np.ndarray) -> PatchAlignment:
+        """Return it as rows `which` of an alignment of more patches at given places, the others not found."""
+        N, C = len(positions), self.by_camera.shape[1]
+        rest = PatchAlignment(
+            positions.copy(),
+            frames.copy(),
+            np.full(N, -1.0),
+            np.zeros(N, int),
+            np.full(N, np.inf),
+            np.full(N, np.inf),
+            np.full((N, C), -1.0),
+        )
+        for field in fields(self):
+            getattr(rest, field.name)[which] = getattr(self, field.name)
+        return rest
+
+
+@dataclass(frozen=True)
+class Patches:
+    """N patches with M samples each, ready to be looked for by C cameras.
+
+    Attributes
+    ----------
+    positions : (N, 3) float, metres, world
+        Where they are now.
+    frames : (N, 3, 3) float
+        World from patch frame, rotations; third axis: outward normal.
+    shape : (N, M, 5) float
+        Samples in the patch's frame and slopes of the surface there: s, t, z (m), ∂z/∂s, ∂z/∂t.
+    size : (N,) float
+        Spacing of the samples: about a pixel, metres.
+    rows : (N,) int
+        Where each has its templates in the next two arrays, which patches share with those they were selected from.
+    templates : (R, C, L, M, 3) float32
+        Grey level and its slopes along s and t, for each camera and blur level.
+    usable : (R, C, M) uint8
+        Samples that the template has.
+    has : (N, C) bool
+        Cameras with a template.
+    hidden : (N, C) float
+        Depth of the patch beyond the (hull's) surface when its template was taken, metres; NaN where there is none.
+    doubt : (N, C) float
+        Standard deviation that the patch's place had when its template was taken, metres.
+    """
+
+    positions: np.ndarray
+    frames: np.ndarray
+    shape: np.ndarray
+    size: np.ndarray
+    rows: np.ndarray
+    templates: np.ndarray
+    usable: np.ndarray
+    has: np.ndarray
+    hidden: np.ndarray
+    doubt: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @classmethod
+    def empty(cls, n_samples: int, n_cameras: int, n_levels: int) -> Patches:
+        """Return no patches."""
+        M, C, L = n_samples, n_cameras, n_levels
+        return cls.without_templates(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, M, 5)), np.zeros(0), C, L)
+
+    @classmethod
+    def without_templates(
+        cls, positions: np.ndarray, frames: np.ndarray, shape: np.ndarray, size: np.ndarray, C: int, L: int
+    ) -> Patches:
+        """Return patches that no camera has a template of yet."""
+        N, M = shape.shape[:2]
+        return cls(
+            np.array(positions, np.float64),
+            np.array(frames, np.float64),
+            shape,
+            size,
+            np.arange(N),
+            np.zeros((N, C, L, M, 3), np.float32),
+            np.zeros((N, C, M), np.uint8),
+            np.zeros((N, C), bool),
+            np.full((N, C), np.nan),
+            np.zeros((N, C)),
+        )
+
+    def select(self, which: np.ndarray) -> Patches:
+        """Return some of them, by a mask or by positions."""
+        return replace(self, **{name: getattr(self, name)[which] for name in _OWN})
+
+    def join(self, other: Patches) -> Patches:
+        """Return these followed by others, without the templates of any that were left out."""
+        parts = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _OWN}
+        parts["rows"] = np.arange(len(self) + len(other))
+        for name in ("templates", "usable"):
+            mine, new = getattr(self, name), getattr(other, name)
+            parts[name] = both = np.empty((len(self) + len(other), *mine.shape[1:]), mine.dtype)
+            np.take(mine, self.rows, axis=0, out=both[: len(self)], mode="clip")  # "raise" would copy once more
+            np.take(new, other.rows, axis=0, out=both[len(self) :], mode="clip")
+        return Patches(**parts)
+
+    def moved(self, positions: np.ndarray, frames: np.ndarray) -> Patches:
+        """Return them at other places."""
+        return replace(self, positions=positions, frames=frames)
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Outward normals, (N, 3) float, world."""
+        return self.frames[:, :, 2]
+
+
+def visible(
+    positions: np.ndarray, frames: np.ndarray, hidden: np.ndarray, view: FrameViews, slack: np.ndarray, facing: float
+) -> np.ndarray:
+    """Find which cameras see patches at given places: (N, C) bool.
+
+    A camera sees a patch that is turned to it if the subject's surface doesn't lie nearer by more than `slack` than it
+    did when the template was taken: a hull stands off the true surface.
+
+    Parameters
+    ----------
+    positions, frames : (N, 3), (N, 3, 3) float
+    hidden : (N, C) float
+        How far behind the surface they were then, see `Patches`.
+    view : FrameViews
+    slack : (N, 1) float, metres
+    facing : float
+        Least cosine between normal and direction to the camera.
+    """
+    depth, surface = view.depths(positions)
+    return (facings(positions, frames[:, :, 2], view) > facing) & (
+        depth - surface - np.nan_to_num(np.maximum(hidden, 0.0)) < slack
+    )
+
+
+def facings(positions: np.ndarray, normals: np.ndarray, view: FrameViews) -> np.ndarray:
+    """Return the cosines between normals and the directions to the cameras: (N, C) float."""
+    ray = view.centers[None] - positions[:, None]
+    return np.einsum("nci,ni->nc", ray, normals) / np.linalg.norm(ray, axis=2)
+
+
+def with_templates(patches: Patches, want: np.ndarray, view: FrameViews, sigma: np.ndarray | None = None) -> Patches:
+    """Take templates in the cameras `want` (N, C) bool that have none; where too little is seen there is none.
+
+    The new patches share the large arrays of templates with those given, which have nothing in the places filled.
+    `sigma` (N,): standard deviation of their places, metres; 0 if not given, as where patches begin.
+    """
+    took = np.ascontiguousarray(want & ~patches.has, np.uint8)
+    take_templates(
+        patches.positions,
+        patches.frames,
+        patches.shape,
+        patches.rows,
+        took,
+        view.levels,
+        view.masks,
+        view.projections,
+        patches.templates,
+        patches.usable,
+    )
+    got = took != 0
+    depth, surface = view.depths(patches.positions)
+    hidden = np.where(got, depth - surface, patches.hidden)
+    doubt = np.where(got, 0.0 if sigma is None else sigma[:, None], patches.doubt)
+    return replace(patches, has=patches.has | got, hidden=hidden, doubt=doubt)
+
+
+def one_template(patches: Patches, view: FrameViews) -> tuple[Patches, np.ndarray]:
+    """Give all cameras the template of the camera (N,) that faces each patch best, of those that have one."""
+    best = np.where(patches.has, facings(patches.positions, patches.normals, view), -2).argmax(axis=1)
+    shared = {
+        name: np.ascontiguousarray(np.repeat(getattr(patches, name)[patches.rows, best][:, None], view.count, axis=1))
+        for name in ("templates", "usable")
+    }
+    return replace(patches, rows=np.arange(len(patches)), has=np.ones_like(patches.has), **shared), best
+
+
+def doubted(patches: Patches, found: PatchAlignment) -> PatchAlignment:
+    """Add to standard deviations how well the places were known at which templates were taken: drift adds up."""
+    part = found.by_camera > -1
+    variance = np.where(part, patches.doubt**2, 0.0).sum(axis=1) / np.maximum(part.sum(axis=1), 1)
+    return replace(
+        found, sigma=np.sqrt(found.sigma**2 + variance), image_sigma=np.sqrt(found.image_sigma**2 + variance)
+    )
+
+
+def align(
+    patches: Patches,
+    which: np.ndarray,
+    positions: np.ndarray,
+    frames: np.ndarray,
+    use: np.ndarray,
+    view: FrameViews,
+    *,
+    iterations: tuple[int, ...],
+    least_correlation: float,
+    prior: tuple[np.ndarray, np.ndarray] | None = None,
+    prior_shift_px: float = 30.0,
+    prior_turn: float = 0.4,
+) -> PatchAlignment:
+    """Align patches with a frame, from the coarsest level to the finest.
+
+    Parameters
+    ----------
+    patches : Patches
+    which : (A,) int
+        Patches to align; the others keep the given places.
+    positions, frames : (N, 3), (N, 3, 3) float
+        Places to start from.
+    use : (N, C) bool
+        Cameras to use.
+    view : FrameViews
+    iterations : tuple of int
+        Most iterations on each level, from the coarsest; a level with −1 is left out, 0 compares only.
+    least_correlation : float
+        A camera counts from here on.
+    prior : pair of (N, 3), (N, 3, 3) float, optional
+        Where the patches are expected; the start if not given.
+    prior_shift_px, prior_turn : float
+        Standard deviation of that, in units of the patches' sample spacing, and radians.
+    """
+    X, Q = np.array(positions, np.float64), np.array(frames, np.float64)
+    N, C = use.shape
+    correlation = np.full((N, C), -1.0)
+    covariance = np.full((N, 6), np.nan)
+    expected = (X.copy(), Q.copy()) if prior is None else prior
+    for level, count in enumerate(iterations):
+        if count < 0:
+            continue
+        align_patches(
+            which,
+            X,
+            Q,
+            patches.shape,
+            patches.size,
+            patches.rows,
+            patches.templates,
+            patches.usable,
+            np.ascontiguousarray(use, np.uint8),
+            view.levels[level],
+            level,
+            1 if level == len(view.levels) - 1 else _COARSE_STRIDE,
+            view.masks,
+            level == len(view.levels) - 1,
+            view.projections,
+            view.centers,
+            expected[0],
+            expected[1],
+            prior_shift_px * patches.size,
+            np.full(N, prior_turn),
+            count,
+            least_correlation,
+            correlation,
+            covariance,
+        )
+    counted = correlation >= least_correlation
+    part = correlation > -1
+    mean = np.where(part, correlation, 0).sum(axis=1) / np.maximum(part.sum(axis=1), 1)
+    best = np.where(counted, correlation, 0).sum(axis=1) / np.maximum(counted.sum(axis=1), 1)
+    score = np.where(part.any(axis=1), np.where(counted.any(axis=1), best, mean), -1.0)
+    sigma = np.sqrt(covariance[:, :3].mean(axis=1))
+    sigma = np.where(np.isfinite(sigma), sigma, np.inf)
+    return PatchAlignment(X, Q, score, counted.sum(axis=1), sigma, sigma, correlation)

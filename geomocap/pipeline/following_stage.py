@@ -1,0 +1,132 @@
+"""Another sequence of a known subject: its model instead of bodies and joints found anew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from geomocap.files.atomic import fingerprint
+from geomocap.files.run import Run, stage_key
+from geomocap.model.ellipsoids import Ellipsoids, fit_ellipsoids
+from geomocap.model.frame_geometry import BodyPoints, Geometry
+from geomocap.pipeline.derived import FROM_BODIES
+from geomocap.pipeline.job import Job
+from geomocap.pipeline.path_choice import OF_TRACKS, patch_paths, point_paths
+from geomocap.pipeline.track_stage import tracks
+from geomocap.pipeline.warnings import WARNINGS_FILE, write_warnings
+from geomocap.scheduling import map_items
+from geomocap.skeleton.kinematics import BodyMotion, posed, since
+from geomocap.skeleton.m3_skeleton import Skeleton
+from geomocap.skeleton.motion_skeleton import skeleton_of_motion
+from geomocap.subject.model_following import FollowedSequence, follow_model
+from geomocap.subject.subject_model import MODEL_FILE, SubjectModel, read_model
+
+
+def segment_with_model(job: Job, geometry: Geometry, source_key: str) -> str:
+    """Follow the job's model, write what a segmentation writes, and return the stage's key."""
+    assert job.model is not None
+    model = read_model(job.model).turned_up(job.up_axis)
+    patches = None
+    wanted = job.config.segmentation.paths
+    if job.capture is not None and wanted != "nodes":
+        patches = tracks(job)
+    key = stage_key(
+        "take",
+        source_key,
+        patches,
+        wanted,
+        fingerprint([job.model]),
+        job.config.following.model_dump(),
+        job.fps,
+        job.up,
+    )
+    outputs = ["ellipsoids.npz", "bodies", "diagnostics.npz", "skeleton.npz", MODEL_FILE]
+    work = partial(_follow, job, geometry, model, patches is not None)
+    return job.stage("segmentation", key, outputs, work, [WARNINGS_FILE, *FROM_BODIES])
+
+
+def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) -> int:
+    frames = len(geometry)
+    features = geometry.features if len(model.colors) else None
+
+    def read(frame: int) -> tuple[np.ndarray, np.ndarray | None]:
+        return geometry.points(frame), None if features is None else features(frame)
+
+    with job.run.timed("model") as count:
+        followed = follow_model(
+            model,
+            read,
+            frames,
+            geometry.spacing,
+            job.up_axis,
+            patch_paths(job.run.read_npz("tracks.npz", OF_TRACKS)) if patches else point_paths(job, geometry),
+            job.config.following,
+            job.progress,
+        )
+        count["items"] = frames
+    label = _Label(geometry, job.run, model, followed.bodies)
+    fitted = list(map_items(label, range(frames), job.executor, "labels", job.progress))
+    names = ("centers", "radii", "rotations", "counts", "errors")
+    together = {name: np.stack([getattr(e, name) for e in fitted]) for name in names}
+    job.run.write_npz("ellipsoids.npz", **together, body=np.arange(model.body_count, dtype=np.int32))
+    job.run.write_npz("skeleton.npz", **_skeleton(model, followed, job.fps).arrays())
+    job.run.write_npz(MODEL_FILE, **model.widened(followed.bodies).reposed(followed.bodies, 0).arrays())
+    job.run.write_npz(
+        "diagnostics.npz",
+        paths=np.array("model"),
+        fit_distance=followed.distance,
+        first_frame=followed.first_frame,
+        joint_is_hinge=model.joint_hinge,
+        joint_axes=posed(model.linkage, followed.bodies, 0).axes,
+    )
+    write_warnings(job.run, _fit_warnings(model, followed, job.config.following.poor_fit))
+    return frames
+
+
+def _skeleton(model: SubjectModel, followed: FollowedSequence, fps: float) -> Skeleton:
+    linkage, motion = posed(model.linkage, followed.bodies, 0), since(followed.bodies, 0)
+    start = followed.bodies.part(slice(0, 1)).carry(model.points, model.skin_bodies, model.skin_weights)[0]
+    owners = model.skin.body
+    own = linkage.hierarchy.body_joints
+    places = [start[owners == b] for b in range(model.body_count)]
+    middle = np.stack([p.mean(axis=0) if len(p) else linkage.joints[own[b]] for b, p in enumerate(places)])
+    centers = np.einsum("tbij,bj->tbi", motion.rotations, middle) + motion.translations
+    joints = linkage.joint_positions(motion)
+    found = skeleton_of_motion(linkage.hierarchy, linkage.joints, motion.rotations, joints, centers, middle, fps)
+    return replace(found, joint_names=model.joint_names, body_names=model.body_names)
+
+
+def _fit_warnings(model: SubjectModel, followed: FollowedSequence, poor: float) -> list[str]:
+    fraction = followed.distance / model.diagonal
+    if float(np.median(fraction)) > poor:
+        return [
+            "The model fits poorly: its surface and that of the sequence are "
+            f"{1000 * np.median(followed.distance):.0f} mm apart ({100 * np.median(fraction):.1f} % of its diagonal; up to {100 * poor:g} % is usual). Is it the same "
+            "subject, at the same scale?"
+        ]
+    bad = np.flatnonzero(fraction > poor)
+    if len(bad):
+        listed = ", ".join(str(t) for t in bad[:5]) + (" …" if len(bad) > 5 else "")
+        return [f"The model fits poorly in {len(bad)} of {len(fraction)} frames ({listed}); look at these."]
+    return []
+
+
+@dataclass(frozen=True)
+class _Label:
+    """Bodies of the points of one frame, written to the run, and an ellipsoid for each."""
+
+    geometry: Geometry
+    run: Run
+    model: SubjectModel
+    bodies: BodyMotion
+
+    def __call__(self, frame: int) -> Ellipsoids:
+        points = self.geometry.points(frame)
+        skin = self.model.skin
+        placed = self.bodies.part(slice(frame, frame + 1)).carry(skin.rest, skin.bodies, skin.fractions)[0]
+        label = skin.body[cKDTree(placed).query(points)[1]].astype(np.int32)
+        BodyPoints(points, label).write(self.run.frame_file("bodies", frame))
+        return fit_ellipsoids(points, label, self.model.body_count, self.geometry.spacing)

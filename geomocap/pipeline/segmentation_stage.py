@@ -1,0 +1,95 @@
+"""Stage: frame geometry → ellipsoids, rigid bodies and skeleton: `ellipsoids.npz`, `bodies/`, `skeleton.npz`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+from geomocap.errors import SettingsError
+from geomocap.files.run import Run, stage_key
+from geomocap.model.frame_geometry import BodyPoints, Geometry
+from geomocap.pipeline.cloud_stage import bounds_of
+from geomocap.pipeline.derived import FROM_BODIES
+from geomocap.pipeline.following_stage import segment_with_model
+from geomocap.pipeline.job import Job
+from geomocap.pipeline.motion_stage import segment_by_motion
+from geomocap.pipeline.sources import Source, geometry_of
+from geomocap.pipeline.track_stage import tracks
+from geomocap.pipeline.warnings import WARNINGS_FILE
+from geomocap.scheduling import map_items
+from geomocap.segmentation.m3 import segment_m3
+from geomocap.segmentation.m3_result import Segmentation
+from geomocap.skeleton.m3_skeleton import skeleton_m3
+from geomocap.subject.subject_model import MODEL_FILE
+
+
+def segment(job: Job, source: Source) -> str:
+    """Find ellipsoids, bodies and skeleton; return the stage's key."""
+    config = job.config
+    if job.capture is not None and config.segmentation.paths == "points":
+        raise SettingsError("segmentation.paths = points is for scans; of a capture take auto, patches or nodes")
+    geometry, source_key = geometry_of(job, source)
+    if job.model is not None:
+        return segment_with_model(job, geometry, source_key)
+    by_motion = config.segmentation.method == "motion" and len(geometry) > 1
+    has_tracks = by_motion and _is_tracked(job, source)
+    tables = ("nodes", "motion_bodies", "motion_skeleton", "refinement") if by_motion else ("skeleton",)
+    settings = {name: getattr(config, name).model_dump() for name in ("segmentation", *tables)}
+    outputs, optional = ["ellipsoids.npz", "bodies", "diagnostics.npz"], [MODEL_FILE, WARNINGS_FILE, *FROM_BODIES]
+    # a single frame has no motion to tell bodies and joints by
+    (outputs if len(geometry) > 1 else optional).append("skeleton.npz")
+    key = stage_key("segmentation", source_key, tracks(job) if has_tracks else None, settings, job.fps)
+    work = partial(segment_by_motion, has_tracks=has_tracks) if by_motion else segment_as_m3
+    return job.stage("segmentation", key, outputs, lambda: work(job, geometry), optional)
+
+
+def _is_tracked(job: Job, source: Source) -> bool:
+    """Whether the surface is to be tracked in the images, which takes a volume."""
+    if job.capture is None or job.config.segmentation.paths in ("nodes", "points", "ellipsoids"):
+        return False
+    return source != "cloud" or bounds_of(job.capture, job.config.cloud) == "hull"
+
+
+def segment_as_m3(job: Job, geometry: Geometry) -> int:
+    """Follow the paper: ellipsoids, bodies from their paths, joints by growing samples; return the frames' number."""
+    frames = len(geometry)
+    found = segment_m3(
+        geometry.points,
+        frames,
+        spacing=geometry.spacing,
+        settings=job.config.segmentation,
+        executor=job.executor,
+        progress=job.progress,
+    )
+    write = _WriteBodies(geometry, job.run, found)
+    for _ in map_items(write, range(frames), job.executor, "bodies", job.progress):
+        pass
+    job.run.write_npz("ellipsoids.npz", **found.arrays())
+    if frames > 1:
+        with job.run.timed("skeleton") as count:
+            skeleton = skeleton_m3(found, job.fps, job.config.skeleton)
+            job.run.write_npz("skeleton.npz", **skeleton.arrays())
+            count["items"] = frames
+    job.run.write_npz(
+        "diagnostics.npz",
+        integrals=found.integrals,
+        threshold=found.threshold,
+        seeds=found.seeds,
+        repaired=found.repaired,
+        touching=found.touching,
+        body=found.body,
+    )
+    return frames
+
+
+@dataclass(frozen=True)
+class _WriteBodies:
+    """Points of one frame with their bodies, written to the run."""
+
+    geometry: Geometry
+    run: Run
+    found: Segmentation
+
+    def __call__(self, frame: int) -> None:
+        points = BodyPoints(self.geometry.points(frame), self.found.body_labels(frame))
+        points.write(self.run.frame_file("bodies", frame))

@@ -1,0 +1,124 @@
+"""Stage: images → silhouettes, `silhouettes/<camera>/000000.png`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from geomocap.carving.holes import fill_false_holes
+from geomocap.carving.silhouette_views import Undistortion
+from geomocap.errors import CaptureError
+from geomocap.files.atomic import write_atomic
+from geomocap.files.capture import Capture
+from geomocap.files.run import Run, stage_key
+from geomocap.pipeline.job import Job
+from geomocap.scheduling import map_items
+from geomocap.silhouettes import (
+    BackgroundModel,
+    SilhouetteSettings,
+    model_from_frames,
+    model_from_plate,
+    region_of_points,
+    silhouette,
+)
+
+
+def silhouettes(job: Job) -> str:
+    """Make the silhouettes of all cameras and frames, and return the stage's key."""
+    capture = job.capture
+    if capture is None:
+        raise CaptureError("silhouettes need a capture")
+    key = stage_key(
+        "silhouettes",
+        str(capture.path.resolve()),
+        capture.fingerprint("images", "videos", "background", "masks", "sparse"),
+        job.config.silhouettes.model_dump(),
+    )
+    job.write_record("silhouettes")
+    return job.stage("silhouettes", key, ["silhouettes"], lambda: _make_silhouettes(job, capture))
+
+
+def _make_silhouettes(job: Job, capture: Capture) -> int:
+    missing = [
+        k for k in range(capture.n_frames) if not all(job.run.silhouette_file(c, k).exists() for c in capture.cameras)
+    ]
+    models: dict[str, BackgroundModel] = {}
+    if missing and not capture.has_masks:
+        learn = _Learn(capture, job.config.silhouettes)
+        learnt = map_items(learn, capture.cameras, job.executor, "background", job.progress, 2)
+        models = dict(zip(capture.cameras, learnt, strict=True))
+    undistortion = None
+    if job.config.silhouettes.repair and capture.is_calibrated and not capture.has_masks:
+        undistortion = Undistortion.of(capture.rig)
+    task = _Cut(capture, job.run, job.config.silhouettes, models, _regions(capture), undistortion)
+    for _ in map_items(task, missing, job.executor, "silhouettes", job.progress, 4):
+        pass
+    return len(missing) * len(capture.cameras)
+
+
+@dataclass(frozen=True)
+class _Learn:
+    """Background model of one camera."""
+
+    capture: Capture
+    settings: SilhouetteSettings
+
+    def __call__(self, camera: str) -> BackgroundModel:
+        recorded = self.capture.sources[camera]  # also the frames before the subject came in
+        count = min(self.settings.samples, len(recorded))
+        chosen = np.unique(np.linspace(0, len(recorded) - 1, count).round().astype(int))
+        frames = [recorded.read(int(k)) for k in chosen]
+        if self.capture.has_background(camera):
+            return model_from_plate(self.capture.background(camera), frames, self.settings, camera)
+        return model_from_frames(frames, self.settings, camera)
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """Silhouettes of one frame, written to the run."""
+
+    capture: Capture
+    run: Run
+    settings: SilhouetteSettings
+    models: dict[str, BackgroundModel]
+    regions: dict[str, np.ndarray]
+    undistortion: Undistortion | None
+
+    def __call__(self, frame: int) -> None:
+        masks = [self.cut(camera, frame) for camera in self.capture.cameras]
+        if self.undistortion is not None:
+            masks = fill_false_holes(self.capture.rig, self.undistortion.views(masks), masks)
+        for camera, mask in zip(self.capture.cameras, masks, strict=True):
+            write_atomic(self.run.silhouette_file(camera, frame), partial(_write_mask, mask))
+
+    def cut(self, camera: str, frame: int) -> np.ndarray:
+        """Silhouette of one image, (H, W) uint8, 0 or 255."""
+        if self.capture.has_masks:
+            return self.capture.mask(camera, frame)
+        image = self.capture.frame(camera, frame)
+        return silhouette(image, self.models[camera], self.settings, self.regions.get(camera))
+
+
+def _write_mask(mask: np.ndarray, path: Path) -> bool:
+    """Write a silhouette as a PNG that is made for speed."""
+    parameters = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+    return cv2.imwrite(str(path), mask, parameters)
+
+
+def _regions(capture: Capture) -> dict[str, np.ndarray]:
+    """Images of the capture's region of interest, (H, W) bool by camera; nothing where there is none."""
+    box = capture.info.region_of_interest
+    if box is None or not capture.is_calibrated:
+        return {}
+    corners = np.stack(np.meshgrid(*np.transpose(box), indexing="ij"), axis=-1).reshape(-1, 3)
+    pixels = capture.rig.project(corners)
+    sizes = capture.rig.sizes
+    return {
+        name: region_of_points(pixels[c], (int(sizes[c, 0]), int(sizes[c, 1])))
+        for c, name in enumerate(capture.cameras)
+        if np.isfinite(pixels[c]).all()
+    }

@@ -1,0 +1,122 @@
+"""Stage: images and volumes → trajectories of surface points, `tracks.npz`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geomocap.carving.silhouette_views import Undistortion
+from geomocap.errors import CaptureError
+from geomocap.files.capture import Capture
+from geomocap.files.images import read_image
+from geomocap.files.run import Run, stage_key
+from geomocap.files.scans import point_spacing
+from geomocap.model.frame_geometry import Voxels, read_cloud
+from geomocap.model.trajectories import REASONS
+from geomocap.patches.frame_views import FrameViews
+from geomocap.patches.patch_settings import TrackingSettings
+from geomocap.patches.patch_tracking import track_surface
+from geomocap.patches.seeding import image_reduction
+from geomocap.pipeline.cloud_stage import HULL_CAMERAS, clouds
+from geomocap.pipeline.derived import KEYPOINT_FILES
+from geomocap.pipeline.job import Job
+from geomocap.pipeline.voxel_stage import voxels
+from geomocap.trajectories.filters import filter_trajectories
+from geomocap.trajectories.smoothing import smooth_motion
+
+_CLOSED = 1.8  # edge of the voxels of a cloud, as a multiple of its spacing: without holes
+
+
+def tracks(job: Job) -> str:
+    """Follow the surface through all frames, and return the stage's key.
+
+    The surface is that of the voxels; where cameras are too few for a hull, the measured cloud. It is made first if
+    need be.
+    """
+    capture = job.capture
+    if capture is None:
+        raise CaptureError("tracks need a capture")
+    pictures = capture.fingerprint("images", "videos", "sparse")
+    tables = ("tracking", "filters", "smoothing")
+    settings = {name: getattr(job.config, name).model_dump() for name in tables}
+    surface = voxels(job) if _has_hull(capture) else clouds(job)
+    key = stage_key("tracks", surface, pictures, settings, job.fps)
+    job.write_record(*tables)
+    return job.stage("tracks", key, ["tracks.npz"], lambda: _track(job, capture), KEYPOINT_FILES)
+
+
+def _track(job: Job, capture: Capture) -> int:
+    read = frame_reader(capture, job.run, job.config.tracking)
+    found = track_surface(read, capture.n_frames, job.config.tracking, job.progress, job.executor)
+    unfiltered = found.positions.astype(np.float32)
+    # nothing is held longer than it is needed: long recordings have many trajectories
+    filtered = filter_trajectories(
+        found, smooth_motion(found.positions, job.fps, found.sigma, job.config.smoothing), job.config.filters
+    )
+    del found
+    kept = filtered.trajectories
+    motion = smooth_motion(kept.positions, job.fps, kept.sigma, job.config.smoothing)
+    job.run.write_npz(
+        "tracks.npz",
+        positions=kept.positions,
+        velocities=motion.velocities,
+        accelerations=motion.accelerations,
+        start=kept.start,
+        end=kept.end,
+        sigma=kept.sigma,
+        correlation=kept.correlation,
+        n_views=kept.n_views,
+        ray=kept.ray.astype(np.float32),
+        velocity_std=motion.velocity_std,
+        acceleration_std=motion.acceleration_std,
+        normals=kept.normals,
+        placed=kept.placed,
+        begin_reason=kept.begin_reason,
+        end_reason=kept.end_reason,
+        reasons=list(REASONS),
+        unfiltered=unfiltered,
+        kept=filtered.kept,
+    )
+    return capture.n_frames
+
+
+def frame_reader(capture: Capture, run: Run, settings: TrackingSettings) -> Callable[[int], FrameViews]:
+    """Return what reads the frames of a run for tracking; the first one tells how far images may be reduced."""
+    spacing = None if _has_hull(capture) else _CLOSED * point_spacing(read_cloud(run.frame_file("cloud", 0)))
+    read = _ReadFrame(capture, run, settings, Undistortion.of(capture.rig), settings.reduction or 1, spacing)
+    return read if settings.reduction else replace(read, reduction=image_reduction(read(0), settings))
+
+
+def _has_hull(capture: Capture) -> bool:
+    return len(capture.rig) >= HULL_CAMERAS
+
+
+def surface_voxels(points: np.ndarray, size: float) -> Voxels:
+    """Return the voxels of `size` (m) that hold points (N, 3): a cloud as a surface that hides what is behind it."""
+    origin = points.min(axis=0) if len(points) else np.zeros(3)
+    indices = np.unique(np.floor((points - origin) / size).astype(np.int32), axis=0)
+    return Voxels(indices, np.zeros((len(indices), 3), np.uint8), origin, size)
+
+
+@dataclass(frozen=True)
+class _ReadFrame:
+    """Images, silhouettes and voxels of a frame as tracking wants them."""
+
+    capture: Capture
+    run: Run
+    settings: TrackingSettings
+    undistortion: Undistortion
+    reduction: int
+    cloud_spacing: float | None
+
+    def __call__(self, frame: int) -> FrameViews:
+        cameras = self.capture.cameras
+        images = self.undistortion.images([self.capture.frame(c, frame) for c in cameras])
+        masks = [read_image(self.run.silhouette_file(c, frame), gray=True) for c in cameras]
+        if self.cloud_spacing is None:
+            surface = Voxels.read(self.run.frame_file("voxels", frame))
+        else:
+            surface = surface_voxels(read_cloud(self.run.frame_file("cloud", frame)), self.cloud_spacing)
+        return FrameViews.of(self.undistortion.views(masks), images, surface, self.settings.blurs_px, self.reduction)

@@ -1,0 +1,375 @@
+"""Ellipsoids matched from frame to frame, with a repair that keeps their number constant."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.spatial.distance import cdist
+
+from geomocap.errors import GeometryError
+from geomocap.model.ellipsoids import Ellipsoids, from_moments, union_errors
+from geomocap.segmentation.contacts import count_contacts
+from geomocap.segmentation.ellipsoid_merging import merge_frame
+from geomocap.segmentation.ellipsoid_splitting import SplitFrame, split_points
+from geomocap.segmentation.m3_settings import SegmentationSettings
+
+_CANDIDATES = 16
+_CONTACTS_EVERY = 4
+
+
+@dataclass(frozen=True)
+class EllipsoidPaths:
+    """The ellipsoids of a sequence, the same K in every frame.
+
+    Attributes
+    ----------
+    ellipsoids : Ellipsoids
+        With a leading axis T: centers (T, K, 3) are the paths.
+    labels : tuple of (N_t,) int16
+        Ellipsoid of every point of every frame.
+    contacts : (K, K) float
+        Neighbouring pairs of points between two ellipsoids, mean over every fourth frame.
+    touching : (K, K) float
+        Fraction of every fourth frame in which two ellipsoids touch.
+    repaired : (T,) int32
+        Ellipsoids that were split because several were matched to them; 0 in the first frame.
+    """
+
+    ellipsoids: Ellipsoids
+    labels: tuple[np.ndarray, ...]
+    contacts: np.ndarray
+    touching: np.ndarray
+    repaired: np.ndarray
+
+
+@njit(cache=True, nogil=True)
+def assign_tree(
+    cost: np.ndarray,
+    candidates: np.ndarray,
+    order: np.ndarray,
+    parent: np.ndarray,
+    old: np.ndarray,
+    new: np.ndarray,
+    coherence: float,
+) -> np.ndarray:
+    """Assign a target to every ellipsoid by dynamic programming on a tree; several may get the same.
+
+    Minimises Σ cost[i, target_i] + coherence · Σ_(edges i, p) ‖(new_target_i − old_i) − (new_target_p − old_p)‖.
+
+    Parameters
+    ----------
+    cost : (K, C) float
+        Cost of the candidates of each ellipsoid.
+    candidates : (K, C) int
+        Targets to choose from.
+    order : (K,) int
+        Parents before children; the stages run through it backwards.
+    parent : (K,) int
+        Parent in the tree; of the first in the order it is not used.
+    old : (K, 3) float
+    new : (L, 3) float
+    coherence : float
+
+    Returns
+    -------
+    (K,) int64
+    """
+    count, choices = cost.shape
+    value = cost.copy()
+    choice = np.empty((count, choices), np.int64)
+    for step in range(count - 1, 0, -1):
+        i = order[step]
+        p = parent[i]
+        for a in range(choices):
+            tp = candidates[p, a]
+            best, arg = np.inf, 0
+            for b in range(choices):
+                v = value[i, b]
+                if v >= best:
+                    continue
+                if coherence > 0.0:
+                    ti = candidates[i, b]
+                    dx = (new[ti, 0] - old[i, 0]) - (new[tp, 0] - old[p, 0])
+                    dy = (new[ti, 1] - old[i, 1]) - (new[tp, 1] - old[p, 1])
+                    dz = (new[ti, 2] - old[i, 2]) - (new[tp, 2] - old[p, 2])
+                    v += coherence * np.sqrt(dx * dx + dy * dy + dz * dz)
+                if v < best:
+                    best, arg = v, b
+            value[p, a] += best
+            choice[i, a] = arg
+    picked = np.empty(count, np.int64)
+    target = np.empty(count, np.int64)
+    for step in range(count):
+        i = order[step]
+        picked[i] = np.argmin(value[i]) if step == 0 else choice[i, picked[parent[i]]]
+        target[i] = candidates[i, picked[i]]
+    return target
+
+
+def _stages(centers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Order of the stages: the minimum spanning tree over the centres, breadth first from the most central one."""
+    distance = cdist(centers, centers)
+    root = int(np.argmin(distance.sum(axis=1)))
+    tree = minimum_spanning_tree(distance + 1e-12)
+    order, parent = breadth_first_order(tree, root, directed=False)
+    return order.astype(np.int64), np.where(parent < 0, root, parent).astype(np.int64)
+
+
+def match_cost(
+    old: np.ndarray, old_counts: np.ndarray, new: np.ndarray, new_counts: np.ndarray, size_weight: float
+) -> np.ndarray:
+    """Cost of every pair of ellipsoids: distance of the centres plus weighted difference of the sizes (section 6).
+
+    The difference of the counts is divided by the square root of the mean count: both terms are lengths then, in
+    spacings, and their balance does not change with the resolution.
+
+    Parameters
+    ----------
+    old, new : (K, 3), (L, 3) float, spacings
+    old_counts, new_counts : (K,), (L,) float
+    size_weight : float
+
+    Returns
+    -------
+    (K, L) float, spacings
+    """
+    difference = np.abs(old_counts[:, None] - new_counts[None])
+    return cdist(old, new) + size_weight / np.sqrt(old_counts.mean()) * difference
+
+
+@njit(cache=True, nogil=True)
+def halve(
+    points: np.ndarray, order: np.ndarray, begin: np.ndarray, end: np.ndarray, moments: np.ndarray, k: int, count: int
+) -> bool:
+    """Cut set k in two by the plane of the split stage, in place; the upper half becomes set `count`.
+
+    Set k is points[begin[k]:end[k]]. Returns False, and changes nothing, if the set can't be cut.
+    """
+    a, b = begin[k], end[k]
+    if b - a < 2:
+        return False
+    pts, within, starts, parts, _ = split_points(points[a:b], 0.0, 1, 1)
+    if starts.shape[0] < 3:
+        return False
+    points[a:b] = pts
+    order[a:b] = order[a:b][within]
+    begin[count], end[count] = a + starts[1], b
+    end[k] = a + starts[1]
+    moments[k], moments[count] = parts[0], parts[1]
+    return True
+
+
+class _Sets:
+    """The sets of a frame while matching is under way: ranges of points that can be cut further."""
+
+    def __init__(self, split: SplitFrame, room: int) -> None:
+        self.points, self.order = split.points.copy(), split.order.copy()
+        self.count = len(split.errors)
+        self.begin = np.zeros(self.count + room, np.int64)
+        self.end = np.zeros(self.count + room, np.int64)
+        self.begin[: self.count], self.end[: self.count] = split.starts[:-1], split.starts[1:]
+        self.moments = np.zeros((self.count + room, 10))
+        self.moments[: self.count] = split.moments
+
+    def halve(self, chosen: np.ndarray) -> int:
+        """Cut the chosen sets in two; returns how many could be cut."""
+        before = self.count
+        for k in chosen:
+            if self.count < len(self.begin) and halve(
+                self.points, self.order, self.begin, self.end, self.moments, k, self.count
+            ):
+                self.count += 1
+        return self.count - before
+
+    @property
+    def counts(self) -> np.ndarray:
+        return self.moments[: self.count, 0]
+
+    @property
+    def centers(self) -> np.ndarray:
+        return self.moments[: self.count, 1:4] / self.counts[:, None]
+
+    def labels(self, sets: np.ndarray) -> np.ndarray:
+        """Label of each of the points, when set k is part of `sets[k]`."""
+        labels = np.empty(len(self.points), np.int32)
+        for k in range(self.count):
+            labels[self.begin[k] : self.end[k]] = sets[k]
+        return labels
+
+
+@dataclass(frozen=True)
+class MatchedFrame:
+    """A frame divided into the K ellipsoids of the sequence.
+
+    Attributes
+    ----------
+    labels : (N,) int16
+        Ellipsoid of each point, in the order in which the points were given.
+    moments : (K, 10) float, grid units
+    errors : (K,) float, grid units
+    contacts : (K, K) int32, optional
+        Neighbouring pairs of points between two ellipsoids, if they were counted.
+    repaired : int
+        Sets that were cut because several ellipsoids had been matched to them.
+    origin : (3,) float, metres, world
+    spacing : float, metres
+    """
+
+    labels: np.ndarray
+    moments: np.ndarray
+    errors: np.ndarray
+    contacts: np.ndarray | None
+    repaired: int
+    origin: np.ndarray
+    spacing: float
+
+    @property
+    def ellipsoids(self) -> Ellipsoids:
+        """The ellipsoids in metres."""
+        return from_moments(self.moments, self.errors, self.origin, self.spacing)
+
+    @property
+    def centers(self) -> np.ndarray:
+        """Centres, (K, 3), spacings, world."""
+        return self.origin / self.spacing + self.moments[:, 1:4] / self.moments[:, :1]
+
+    @classmethod
+    def of(
+        cls, split: SplitFrame, sets: _Sets, partner: np.ndarray, count: int, repaired: int, touch: bool
+    ) -> MatchedFrame:
+        """Unite the sets of each partner."""
+        ordered = sets.labels(partner)
+        moments = np.zeros((count, 10))
+        np.add.at(moments, partner, sets.moments[: sets.count])
+        labels = np.empty(len(ordered), np.int16)
+        labels[sets.order] = ordered
+        return cls(
+            labels,
+            moments,
+            union_errors(sets.points, sets.begin, sets.end, partner, moments),
+            count_contacts(sets.points, ordered, count) if touch else None,
+            repaired,
+            split.origin,
+            split.spacing,
+        )
+
+
+def first_frame(split: SplitFrame, settings: SegmentationSettings) -> MatchedFrame:
+    """Merge the first frame (section 5.2.2); the number of its ellipsoids is that of the sequence."""
+    merged = merge_frame(split, settings.merge_error)
+    return MatchedFrame.of(split, _Sets(split, 0), merged, int(merged.max()) + 1, 0, True)
+
+
+def match_frame(
+    before: MatchedFrame, split: SplitFrame, settings: SegmentationSettings, frame: int = 0, touch: bool = True
+) -> MatchedFrame:
+    """Match the K ellipsoids of a frame to the leaves of the next, and make these K as well (section 6, figure 3).
+
+    Parameters
+    ----------
+    before : MatchedFrame
+        Frame t.
+    split : SplitFrame
+        The leaves of frame t + 1.
+    settings : SegmentationSettings
+    frame : int
+        Number of frame t + 1, for errors.
+    touch : bool
+        Whether to count contacts.
+
+    Returns
+    -------
+    MatchedFrame
+        Frame t + 1 in K sets: set k is the partner of set k of frame t.
+
+    Raises
+    ------
+    GeometryError
+        If the frame has too few points for K ellipsoids.
+    """
+    count = len(before.moments)
+    old, old_counts = before.centers - split.origin / split.spacing, before.moments[:, 0]
+    order, parent = _stages(old) if settings.coherence_weight > 0 else (np.arange(count), np.zeros(count, np.int64))
+    sets = _Sets(split, 4 * count)
+    repaired = 0
+    while True:
+        new = sets.centers
+        cost = match_cost(old, old_counts, new, sets.counts, settings.size_weight)
+        candidates = _cheapest(cost, 1 if settings.coherence_weight == 0 else _CANDIDATES)
+        chosen = np.take_along_axis(cost, candidates, axis=1)
+        target = assign_tree(chosen, candidates, order, parent, old, new, settings.coherence_weight)
+        # Duplicated ellipsoids: split them and assign again
+        duplicated = np.flatnonzero(np.bincount(target) > 1)
+        cut = sets.halve(duplicated)
+        repaired += cut
+        if cut == 0:
+            break
+    if len(duplicated):
+        # Splitting has not told them apart: the cheapest one-to-one assignment does
+        while sets.count < count and sets.halve(np.argsort(-sets.counts, kind="stable")[:1]):
+            repaired += 1
+        if sets.count < count:
+            raise GeometryError(
+                f"frame {frame}: its {len(split.points)} points can't be divided into the {count} ellipsoids of the "
+                "first frame; check this frame's geometry, or leave it out"
+            )
+        new = sets.centers
+        target = linear_sum_assignment(match_cost(old, old_counts, new, sets.counts, settings.size_weight))[1]
+    # Missing correspondences: merge the ellipsoid into the nearest matched one
+    partner = cdist(new, new[target]).argmin(axis=1).astype(np.int32)
+    partner[target] = np.arange(count)
+    return MatchedFrame.of(split, sets, partner, count, repaired, touch)
+
+
+def _cheapest(cost: np.ndarray, number: int) -> np.ndarray:
+    """Numbers of the cheapest targets of each ellipsoid, (K, C)."""
+    if number == 1:
+        return cost.argmin(axis=1)[:, None]
+    return np.argsort(cost, axis=1, kind="stable")[:, :number]
+
+
+def match_frames(splits: Iterable[SplitFrame], settings: SegmentationSettings) -> EllipsoidPaths:
+    """Merge the first frame and match all others along the sequence, two frames at a time.
+
+    Parameters
+    ----------
+    splits : iterable of SplitFrame
+        The frames in order; each is let go after the next.
+    settings : SegmentationSettings
+
+    Raises
+    ------
+    GeometryError
+        If there is no frame, or one has too few points.
+    """
+    frames, labels, repaired = [], [], []
+    current: MatchedFrame | None = None
+    for number, split in enumerate(splits):
+        if current is None:
+            current = first_frame(split, settings)
+            looks = 0
+            contacts = np.zeros((len(current.moments),) * 2)
+            touching = np.zeros(contacts.shape)
+        else:
+            current = match_frame(current, split, settings, number, number % _CONTACTS_EVERY == 0)
+        frames.append(current.ellipsoids)
+        labels.append(current.labels)
+        repaired.append(current.repaired)
+        if current.contacts is not None:
+            looks += 1
+            contacts += current.contacts
+            touching += current.contacts > 0
+    if current is None:
+        raise GeometryError("no frames to segment; the capture or the folder of scans is empty")
+    return EllipsoidPaths(
+        Ellipsoids.stack(frames),
+        tuple(labels),
+        contacts / looks,
+        touching / looks,
+        np.array(repaired, np.int32),
+    )

@@ -1,0 +1,302 @@
+"""Refinement: motion, joints and skin of connected bodies, over all frames, against the paths of their samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import Field
+
+from geomocap.bodies.motion_bodies import MotionBodies
+from geomocap.model.motion_paths import DEPTH_FRACTION, MotionPaths, sure_part, within_ray
+from geomocap.settings import Settings
+from geomocap.skeleton.articulated_adjustment import JointPrior, adjust
+from geomocap.skeleton.body_observations import Observations, SkinPoints
+from geomocap.skeleton.bone_motion import fit_offsets, forward_kinematics, local_rotations
+from geomocap.skeleton.hinges import find_hinges, turn_information
+from geomocap.skeleton.kinematics import (
+    BodyMotion,
+    JointMotion,
+    Linkage,
+    body_motion,
+    joint_motion,
+    posed,
+    since,
+)
+from geomocap.skeleton.motion_skeleton import MotionSkeleton, skeleton_of_motion
+from geomocap.skeleton.motion_smoothness import Smoothness, typical_accelerations
+from geomocap.skeleton.skinning import candidates_near, fit_fractions
+
+_MEDIAN_LENGTH = 1.54  # median length of a normal vector of three dimensions, standard deviations
+_SETTLE_ROUNDS = 3
+
+
+class RefinementSettings(Settings):
+    """How the motion of connected bodies is refined over all frames."""
+
+    rounds: int = Field(
+        default=3, ge=0, description="rounds of skin weights, shape, and motion with joints; 0: no refinement"
+    )
+    steps: int = Field(default=4, ge=1, description="steps of each adjustment of motion and joints")
+    independence: float = Field(
+        default=0.3, gt=0, le=1, description="fraction of the observations that err independently of each other (0..1)"
+    )
+    noise: float = Field(
+        default=2e-4, gt=0, description="least standard deviation of how a sample follows its bodies (diagonals)"
+    )
+    joint_sigma: float = Field(
+        default=2e-3,
+        gt=0,
+        description="standard deviation of the joints found before, against all observations (diagonals)",
+    )
+    least_slip: float = Field(
+        default=3e-4, gt=0, description="least standard deviation of how far a joint's bodies part (diagonals)"
+    )
+    blend_sigma: float = Field(
+        default=1e-3, gt=0, description="misfit that is worth a change of the skin weights by one (diagonals)"
+    )
+    least_turn_deg: float = Field(
+        default=0.3, gt=0, description="least scale of the turning accelerations (degrees/frame²)"
+    )
+    least_shift: float = Field(
+        default=5e-4, gt=0, description="least scale of the root's accelerations (diagonals/frame²)"
+    )
+    cutoff: float = Field(
+        default=3.0, gt=0, description="residuals and accelerations beyond count less (standard deviations)"
+    )
+
+
+@dataclass(frozen=True)
+class RefinedMotion:
+    """A refined motion, counted from frame 0.
+
+    Attributes
+    ----------
+    linkage : Linkage
+        In the pose of frame 0.
+    bodies : BodyMotion
+        Not quite held together by the joints, see `looseness` of `adjust`.
+    points : SkinPoints
+        The samples in the pose of frame 0, with their skin weights.
+    sigma : (N,) float, metres
+        How well each sample follows its bodies: standard deviation of a coordinate.
+    """
+
+    linkage: Linkage
+    bodies: BodyMotion
+    points: SkinPoints
+    sigma: np.ndarray
+
+    def joint_positions(self) -> np.ndarray:
+        """Where the two bodies of each joint carry it, in the middle, (T, J, 3), metres, world."""
+        ends = self.linkage.hierarchy.joint_bodies
+        carried = [
+            np.einsum("tjik,jk->tji", self.bodies.rotations[:, ends[:, e]], self.linkage.joints)
+            + self.bodies.translations[:, ends[:, e]]
+            for e in (0, 1)
+        ]
+        return 0.5 * (carried[0] + carried[1])
+
+
+def refine_skeleton(
+    found: MotionSkeleton, bodies: MotionBodies, paths: MotionPaths, settings: RefinementSettings | None = None
+) -> tuple[MotionSkeleton, MotionBodies]:
+    """Refine a skeleton and the bodies that it connects.
+
+    Parameters
+    ----------
+    found : MotionSkeleton
+    bodies : MotionBodies
+        Of the samples of `paths`.
+    paths : MotionPaths
+    settings : RefinementSettings, optional
+
+    Returns
+    -------
+    MotionSkeleton
+    MotionBodies
+        With refined motion, rest and weights; labels stay.
+    """
+    settings = settings or RefinementSettings()
+    if settings.rounds == 0:
+        return found, bodies
+    linkage, motion = linkage_of(found)
+    points = SkinPoints.of_weights(bodies.rest, bodies.weights)
+    misses = np.array([joint.miss for joint in found.joints])
+    refined = refine_motion(linkage, motion, points, paths, bodies.diagonal, settings, misses)
+    bodies = replace(
+        bodies,
+        weights=refined.points.weights(bodies.body_count),
+        rotations=refined.bodies.rotations,
+        translations=refined.bodies.translations,
+        rest=refined.points.rest,
+    )
+    middle = np.stack([bodies.rest[bodies.label == b].mean(axis=0) for b in range(bodies.body_count)])
+    centers, root = bodies.centers, linkage.hierarchy.root
+    # Bones that keep their length, their joints as near as can be to where bodies meet
+    places = refined.joint_positions()
+    offsets, _ = fit_offsets(linkage.hierarchy, bodies.rotations, centers[:, root], places, centers)
+    local = local_rotations(bodies.rotations, linkage.hierarchy)
+    places, _ = forward_kinematics(linkage.hierarchy, offsets, local, centers[:, root])
+    skeleton = skeleton_of_motion(
+        linkage.hierarchy, places[0], bodies.rotations, places, centers, middle, found.skeleton.fps
+    )
+    joints = tuple(
+        replace(joint, point=point, axis=axis, hinge=bool(hinge))
+        for joint, point, axis, hinge in zip(
+            found.joints, places[0], refined.linkage.axes, refined.linkage.hinge, strict=True
+        )
+    )
+    return MotionSkeleton(skeleton, joints, found.costs), bodies
+
+
+def linkage_of(found: MotionSkeleton) -> tuple[Linkage, JointMotion]:
+    """Linkage of a skeleton, all joints balls, and its motion."""
+    skeleton = found.skeleton
+    axes = np.array([joint.axis / np.linalg.norm(joint.axis) for joint in found.joints]).reshape(-1, 3)
+    linkage = Linkage(
+        skeleton.hierarchy,
+        skeleton.joint_positions[0],
+        axes,
+        np.zeros(len(axes), bool),
+        skeleton.body_positions[0, skeleton.root],
+    )
+    return linkage, joint_motion(linkage, skeleton.body_rotations, skeleton.body_positions[:, skeleton.root])
+
+
+def refine_motion(
+    linkage: Linkage,
+    motion: JointMotion,
+    points: SkinPoints,
+    paths: MotionPaths,
+    diagonal: float,
+    settings: RefinementSettings | None = None,
+    misses: np.ndarray | None = None,
+) -> RefinedMotion:
+    """Find, by turns, skin weights and shape, and the motion of all frames together with the joints.
+
+    Each sample counts by how well it follows its bodies, so that soft skin has little say. In frames without
+    observations the temporal prior carries the motion on.
+
+    Parameters
+    ----------
+    linkage, motion
+        Start.
+    points : SkinPoints
+        The samples, at rest.
+    paths : MotionPaths
+        What was seen of them.
+    diagonal : float, metres
+        Of the subject.
+    settings : RefinementSettings, optional
+    misses : (J,) float, metres, optional
+        How far the bodies, each by itself, carry each joint apart. A joint may slip by as much, and by what it still
+        does after each round: one that is none, as a body between was not found, doesn't bend its bodies' motion.
+    """
+    settings = settings or RefinementSettings()
+    prior = JointPrior(linkage.joints, settings.joint_sigma * diagonal)
+    least = settings.noise * diagonal
+    tightest = np.full(len(linkage.joints), settings.least_slip * diagonal)
+    looseness = tightest if misses is None else np.maximum(misses, tightest)
+    bodies = body_motion(linkage, motion)
+    sigma = _sample_sigma(bodies, points, paths, least)
+    for k in range(settings.rounds):
+        # Shape and skin of the motion so far
+        if k > 0:
+            trust = _trust(bodies, points, paths, settings.cutoff * sigma)
+            pull = np.full(len(points), (settings.blend_sigma * diagonal) ** 2)
+            near = candidates_near(linkage, points)
+            carried = bodies.carry(points.rest, points.bodies, points.fractions).swapaxes(0, 1)
+            seen = within_ray(paths.positions, carried, paths.ray)
+            points = fit_fractions(points, bodies, seen, trust, near, pull)
+        points = _settled(points, bodies, paths, settings.cutoff * sigma)
+        sigma = _sample_sigma(bodies, points, paths, least)
+        if k == settings.rounds - 1:
+            linkage = _with_hinges(linkage, motion, bodies, points, paths, sigma, settings.independence)
+            motion = replace(joint_motion(linkage, bodies.rotations, motion.root), slip=motion.slip)
+        # Motion and joints of the shape so far
+        spread = np.broadcast_to(sigma[:, None] / np.sqrt(settings.independence), paths.seen.shape)
+        adjusted = adjust(
+            linkage,
+            motion,
+            points,
+            Observations.of_paths(paths.positions, spread, ray=paths.ray),
+            smoothness=smoothness_of(linkage, motion, diagonal, settings),
+            joint_prior=prior,
+            looseness=looseness,
+            cutoff=settings.cutoff,
+            rounds=settings.steps,
+        )
+        linkage, motion, bodies = adjusted.linkage, adjusted.motion, adjusted.bodies
+        assert motion.slip is not None
+        slips = np.sqrt((motion.slip**2).sum(axis=2).mean(axis=0) / 3.0)
+        looseness = np.clip(slips, tightest, looseness)
+    first = bodies.part(slice(0, 1)).carry(points.rest, points.bodies, points.fractions)[0]
+    return RefinedMotion(posed(linkage, bodies, 0), since(bodies, 0), replace(points, rest=first), sigma)
+
+
+def _with_hinges(
+    linkage: Linkage,
+    motion: JointMotion,
+    bodies: BodyMotion,
+    points: SkinPoints,
+    paths: MotionPaths,
+    sigma: np.ndarray,
+    independence: float,
+) -> Linkage:
+    """Linkage whose hinges are those that the observations can't tell from hinges."""
+    information = turn_information(linkage, bodies, points, paths.seen, independence / sigma**2)
+    shown = np.bincount(points.body, paths.seen.sum(axis=1), linkage.body_count)
+    observations = independence * shown[linkage.hierarchy.joint_bodies].sum(axis=1)
+    return find_hinges(linkage, motion, information, observations)
+
+
+def smoothness_of(linkage: Linkage, motion: JointMotion, diagonal: float, settings: RefinementSettings) -> Smoothness:
+    """Temporal prior whose scales are the accelerations that the motion has, medians over time, above the floors."""
+    turn, shift = typical_accelerations(linkage, motion)
+    return Smoothness(
+        np.maximum(turn, np.deg2rad(settings.least_turn_deg)),
+        max(shift, settings.least_shift * diagonal),
+        settings.cutoff,
+    )
+
+
+def _misses(bodies: BodyMotion, points: SkinPoints, paths: MotionPaths) -> np.ndarray:
+    """Distances of what was seen from where the bodies carry the points, (N, T), metres; NaN where not seen."""
+    carried = bodies.carry(points.rest, points.bodies, points.fractions).swapaxes(0, 1)
+    return np.linalg.norm(sure_part(carried - paths.positions, paths.ray), axis=2)
+
+
+def _trust(bodies: BodyMotion, points: SkinPoints, paths: MotionPaths, cutoff: np.ndarray) -> np.ndarray:
+    """Weights of the observations by their misses, (N, T): a half at the cutoff (Cauchy); 0 where not seen."""
+    miss = _misses(bodies, points, paths)
+    return np.where(paths.seen, 1.0 / (1.0 + (np.where(paths.seen, miss, 0.0) / cutoff[:, None]) ** 2), 0.0)
+
+
+def _sample_sigma(bodies: BodyMotion, points: SkinPoints, paths: MotionPaths, least: float) -> np.ndarray:
+    """Standard deviation of a coordinate of each sample, (N,): what is stated, and how well it follows its bodies."""
+    follows = np.nanmedian(_misses(bodies, points, paths), axis=1) / _MEDIAN_LENGTH
+    return np.maximum(np.hypot(paths.typical_sigma(), follows), least)
+
+
+def _settled(points: SkinPoints, bodies: BodyMotion, paths: MotionPaths, cutoff: np.ndarray) -> SkinPoints:
+    """Points with the places at rest that fit the motion best: least squares over the frames, robust."""
+    frames, count = len(bodies.rotations), len(points)
+    matrix, offset = np.zeros((frames, count, 3, 3)), np.zeros((frames, count, 3))
+    for k in range(points.bodies.shape[1]):
+        matrix += points.fractions[:, k, None, None] * bodies.rotations[:, points.bodies[:, k]]
+        offset += points.fractions[:, k, None] * bodies.translations[:, points.bodies[:, k]]
+    target = np.where(paths.seen[..., None], paths.positions, 0.0).swapaxes(0, 1) - offset
+    counted = matrix
+    if paths.ray is not None:
+        ray = paths.ray.swapaxes(0, 1)
+        along = (1.0 - DEPTH_FRACTION**2) * (ray[:, :, None] @ matrix)
+        counted = matrix - ray[..., None] * along
+    rest = points.rest
+    for _ in range(_SETTLE_ROUNDS):
+        trust = _trust(bodies, replace(points, rest=rest), paths, cutoff).T
+        turned = (trust[..., None, None] * counted).swapaxes(2, 3)
+        normal = (turned @ matrix).sum(axis=0) + 1e-3 * np.eye(3)
+        right = (turned @ target[..., None]).sum(axis=0)[..., 0] + 1e-3 * rest
+        rest = np.linalg.solve(normal, right[..., None])[..., 0]
+    return replace(points, rest=rest)

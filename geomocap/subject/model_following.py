@@ -1,0 +1,215 @@
+"""Another sequence of a known subject: its model is found in a frame, followed, and fitted to all frames together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from geomocap.errors import GeometryError
+from geomocap.model.motion_paths import MotionPaths
+from geomocap.progress import Progress, silent
+from geomocap.settings import Settings
+from geomocap.skeleton.articulated_adjustment import adjust
+from geomocap.skeleton.body_observations import Observations, SkinPoints
+from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, body_motion
+from geomocap.skeleton.motion_smoothness import PosePrior, Smoothness, typical_accelerations
+from geomocap.subject.pose_search import find_pose, fit_pose
+from geomocap.subject.sequence_paths import attach_paths, turned_by_paths
+from geomocap.subject.subject_model import SubjectModel
+from geomocap.subject.surface_matching import (
+    FrameSurface,
+    MatchingScales,
+    ModelSurface,
+    distance_between,
+    match_surfaces,
+)
+
+_STAGE = "model"
+_REACH = 3.0  # standard deviations of the surface
+_NOISE = 2e-4  # diagonals
+_PATH_ROUNDS = 2  # the second with what the first has put right
+
+
+class FollowingSettings(Settings):
+    """How the model of a subject is followed through another sequence."""
+
+    points: int = Field(default=1200, ge=100, description="points of the model, and of each frame, that are matched")
+    start_frames: int = Field(default=4, ge=1, description="frames in which the model is looked for")
+    steps: int = Field(default=8, ge=1, description="times that points are matched anew in each frame")
+    rounds: int = Field(default=5, ge=0, description="rounds in which all frames are fitted together")
+    normal: float = Field(default=0.03, ge=0, description="weight of normals in matching (diagonals)")
+    color: float = Field(default=0.03, ge=0, description="weight of colours in matching (diagonals)")
+    reach: float = Field(default=0.1, gt=0, description="points farther apart don't match (diagonals)")
+    along: float = Field(default=0.05, ge=0, description="weight of distances along the surface, against across it")
+    independence: float = Field(
+        default=0.05, gt=0, le=1, description="fraction of the surface points that err independently (0..1)"
+    )
+    path_independence: float = Field(
+        default=0.3,
+        gt=0,
+        le=1,
+        description="fraction of the tracked patches' observations that err independently (0..1)",
+    )
+    turn_deg: float = Field(
+        default=15.0, gt=0, description="how far joints may leave the pose expected in the next frame (degrees)"
+    )
+    least_turn_deg: float = Field(
+        default=0.5, gt=0, description="least scale of the turning accelerations (degrees/frame²)"
+    )
+    least_shift: float = Field(default=1e-3, gt=0, description="least scale of the root's (diagonals/frame²)")
+    poor_fit: float = Field(
+        default=0.025,
+        gt=0,
+        description="distances between model and sequence above this call for a warning (diagonals)",
+    )
+
+
+@dataclass(frozen=True)
+class FollowedSequence:
+    """Motion of a model's bodies in a sequence.
+
+    Attributes
+    ----------
+    bodies : BodyMotion
+        From the model's rest pose.
+    distance : (T,) float, metres
+        Between the model's surface and each frame's: root mean square of both directions.
+    first_frame : int
+        Where the model was found.
+    """
+
+    bodies: BodyMotion
+    distance: np.ndarray
+    first_frame: int
+
+
+def follow_model(
+    model: SubjectModel,
+    read: Callable[[int], tuple[np.ndarray, np.ndarray | None]],
+    frames: int,
+    spacing: float,
+    up: int,
+    paths: MotionPaths | None = None,
+    settings: FollowingSettings | None = None,
+    progress: Progress = silent,
+) -> FollowedSequence:
+    """Follow a model through a sequence.
+
+    Parameters
+    ----------
+    model : SubjectModel
+    read : callable
+        `read(frame) -> (points (N, 3) metres, colors (N, 3) 0 to 1 or None)`.
+    frames : int
+    spacing : float, metres
+        Distance of neighbouring points.
+    up : int
+        World axis that points up.
+    paths : MotionPaths, optional
+        Points of the surface that were tracked in this sequence; they keep it from sliding.
+    settings : FollowingSettings, optional
+    progress : Progress
+
+    Raises
+    ------
+    GeometryError
+        If a frame holds too few points.
+    """
+    settings = settings or FollowingSettings()
+    diagonal = model.diagonal
+    scales = MatchingScales(
+        settings.normal * diagonal,
+        settings.color * diagonal,
+        settings.reach * diagonal,
+        max(spacing, model.spacing / 2),
+        settings.along,
+        settings.independence,
+    )
+    views = [_view(*read(t), t, spacing, scales, settings.points) for t in range(frames)]
+    colored = all(v.surface.colors is not None for v in views)
+    surface = ModelSurface.of_model(model, settings.points, colored)
+    # Where it is
+    asked = np.unique(np.linspace(0, frames, settings.start_frames, endpoint=False).astype(int)).tolist()
+    best, pose = find_pose(model, surface, [views[t] for t in asked], scales, up)
+    first = asked[best]
+    progress(_STAGE, 1, frames + 1)
+    # Frame by frame, both ways
+    pieces: dict[int, JointMotion] = {first: pose}
+    for order in (range(first + 1, frames), range(first - 1, -1, -1)):
+        for t in order:
+            back = 1 if order.step > 0 else -1
+            expected = _carried_on(pieces[t - back], pieces.get(t - 2 * back))
+            prior = PosePrior(expected, np.deg2rad(settings.turn_deg), np.deg2rad(2 * settings.turn_deg), diagonal)
+            pieces[t] = fit_pose(model.linkage, expected, surface, [views[t]], scales, prior, settings.steps)
+            progress(_STAGE, len(pieces), frames + 1)
+    motion = JointMotion(*(np.concatenate([getattr(pieces[t], n) for t in range(frames)]) for n in ("local", "root")))
+    # All frames together
+    motion = _fit_all(model, surface, motion, views, scales, paths, settings)
+    bodies = body_motion(model.linkage, motion)
+    distance = np.array([distance_between(p, v) for p, v in zip(surface.posed(bodies), views, strict=True)])
+    progress(_STAGE, frames + 1, frames + 1)
+    return FollowedSequence(bodies, distance, first)
+
+
+def _view(
+    points: np.ndarray, colors: np.ndarray | None, frame: int, spacing: float, scales: MatchingScales, count: int
+) -> FrameSurface:
+    if len(points) < 4:
+        raise GeometryError(f"frame {frame}: {len(points)} points; the model can't be fitted to so few")
+    return FrameSurface.of_points(points, colors, spacing, scales, count)
+
+
+def _carried_on(last: JointMotion, before: JointMotion | None) -> JointMotion:
+    """Pose that follows at the same pace."""
+    if before is None:
+        return last
+    turn = last.local @ before.local.swapaxes(-1, -2)
+    vectors = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec()
+    turn = Rotation.from_rotvec(vectors).as_matrix().reshape(turn.shape)
+    return JointMotion(turn @ last.local, 2.0 * last.root - before.root)
+
+
+def _fit_all(
+    model: SubjectModel,
+    surface: ModelSurface,
+    motion: JointMotion,
+    views: list[FrameSurface],
+    scales: MatchingScales,
+    paths: MotionPaths | None,
+    settings: FollowingSettings,
+) -> JointMotion:
+    """Motion of all frames that fits surfaces and paths best, evenly in time."""
+    linkage = model.linkage
+    count = len(surface.skin)
+    reach = _REACH * scales.sigma
+    if paths is not None:
+        for _ in range(_PATH_ROUNDS):
+            bodies = body_motion(linkage, motion)
+            skin = attach_paths(model, bodies, paths, reach)
+            motion = turned_by_paths(linkage, motion, bodies, skin, paths, _NOISE * model.diagonal)
+    for _ in range(settings.rounds):
+        bodies = body_motion(linkage, motion)
+        points = surface.skin
+        observations = match_surfaces(surface, surface.posed(bodies), views, scales)
+        if paths is not None:
+            skin = attach_paths(model, bodies, paths, reach)
+            points = SkinPoints(*(np.concatenate([getattr(points, n), getattr(skin, n)]) for n in _SKIN))
+            sigma = np.hypot(paths.typical_sigma(), 0.2 * scales.sigma) / np.sqrt(settings.path_independence)
+            spread = np.broadcast_to(sigma[:, None], paths.seen.shape)
+            observations = observations.joined(Observations.of_paths(paths.positions, spread, count, paths.ray))
+        prior = _smoothness(linkage, motion, model.diagonal, settings)
+        motion = adjust(linkage, motion, points, observations, smoothness=prior, rounds=3).motion
+    return motion
+
+
+_SKIN = ("rest", "bodies", "fractions")
+
+
+def _smoothness(linkage: Linkage, motion: JointMotion, diagonal: float, settings: FollowingSettings) -> Smoothness:
+    turn, shift = typical_accelerations(linkage, motion)
+    least = np.deg2rad(settings.least_turn_deg)
+    return Smoothness(np.maximum(turn, least), max(shift, settings.least_shift * diagonal), 3.0)

@@ -1,1 +1,0 @@
-"""Motion of surfaces: nodes followed on geometry without texture, patches followed in images, and their paths."""

@@ -1,0 +1,1 @@
+"""What is done to trajectories, whatever made them: filters, smoothing, gaps, choice."""
