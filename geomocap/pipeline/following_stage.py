@@ -104,8 +104,8 @@ def _fit_warnings(model: SubjectModel, followed: FollowedSequence, poor: float) 
     if float(np.median(fraction)) > poor:
         return [
             "The model fits poorly: its surface and that of the sequence are "
-            f"{1000 * np.median(followed.distance):.0f} mm apart ({100 * np.median(fraction):.1f} % of its diagonal; up to {100 * poor:g} % is usual). Is it the same "
-            "subject, at the same scale?"
+            f"{1000 * np.median(followed.distance):.0f} mm apart ({100 * np.median(fraction):.1f} % of its diagonal; "
+            f"up to {100 * poor:g} % is usual). Is it the same subject, at the same scale?"
         ]
     bad = np.flatnonzero(fraction > poor)
     if len(bad):
