@@ -6,10 +6,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geomocap.model.motion_paths import DEPTH_FRACTION, sure_part
-from geomocap.model.rotations import nearest_rotation
+from geomocap.model.rotations import rigid_motion, turn_angles
 
 _ROUNDS = 5
 _DAMPING = 1e-9
+_STILL = 1e-12 * np.eye(3)  # square metres: a group of one place doesn't turn
 _START_ROUNDS = 3  # with all directions alike, before rays are told apart
 
 
@@ -52,9 +53,10 @@ def fit_rigid_motion(
     given = np.maximum(weights, 1e-9)
     robust = given
     total = given.sum(axis=1)
+    moving = np.ascontiguousarray(positions.swapaxes(0, 1))
     for k in range(rounds if ray is None else _START_ROUNDS + rounds):
         if ray is None or k < _START_ROUNDS:
-            rotations, translations = _kabsch(positions, rest, robust)
+            rotations, translations = rigid_motion(rest, moving, robust.T, prior=_STILL)
         else:
             rotations, translations = _step(rotations, translations, positions, rest, robust, ray)
         carried = (rest @ rotations.transpose(0, 2, 1) + translations[:, None]).swapaxes(0, 1)
@@ -65,17 +67,6 @@ def fit_rigid_motion(
         by_position = 1.0 / (1.0 + (miss / (2.0 * scale)) ** 4)
         robust = given * by_sample[:, None] * by_position
     return rotations, translations, residuals
-
-
-def _kabsch(positions: np.ndarray, rest: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    total = weights.sum(axis=0)
-    fraction = (weights / total).T  # (T, n)
-    moving = positions.swapaxes(0, 1)  # (T, n, 3)
-    center = (fraction[:, None] @ moving)[:, 0]
-    start = fraction @ rest
-    moments = (moving * fraction[..., None]).transpose(0, 2, 1) @ rest - center[:, :, None] * start[:, None, :]
-    rotations = nearest_rotation(moments + 1e-12 * np.eye(3))
-    return rotations, center - (rotations @ start[..., None])[..., 0]
 
 
 def _step(
@@ -114,12 +105,6 @@ def _step(
     step = np.linalg.solve(normal + _DAMPING * size * np.eye(6), right[..., None])[..., 0]
     turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
     return turn @ rotations, translations + step[:, 3:] + middle - (turn @ middle[..., None])[..., 0]
-
-
-def turn_angles(rotations: np.ndarray) -> np.ndarray:
-    """Angles of rotation matrices (…, 3, 3), radians."""
-    cosine = (np.trace(rotations, axis1=-2, axis2=-1) - 1.0) / 2.0
-    return np.arccos(np.clip(cosine, -1.0, 1.0))
 
 
 def relative_turn(first: np.ndarray, second: np.ndarray, fraction: float = 0.05) -> float:

@@ -17,6 +17,7 @@ from geomocap.calibration.orientation import ideal_coordinates, triangulate
 from geomocap.calibration.projection import interior_of
 from geomocap.errors import CalibrationError
 from geomocap.model.rig import Rig
+from geomocap.model.rotations import rigid_motion
 
 AXES = {"x": 0, "y": 1, "z": 2}
 
@@ -182,12 +183,9 @@ def rigid_alignment(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray,
     scale : float
         Not applied: 1 if both are metric (Umeyama 1991).
     """
+    R, t = rigid_motion(source, target)
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    U, s, Vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
-    R = (U * sign) @ Vt
-    scale = float((s * sign).sum() / max((a * a).sum(), 1e-30))
-    return R, target.mean(axis=0) - R @ source.mean(axis=0), scale
+    return R, t, float(((a @ R.T) * b).sum() / max((a * a).sum(), 1e-30))
 
 
 def datum_from_points(network: Network, pixels: np.ndarray, world: np.ndarray, what: str = "given points") -> Datum:

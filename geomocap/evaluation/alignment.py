@@ -18,6 +18,7 @@ from scipy.optimize import linear_sum_assignment, minimize_scalar
 from geomocap.evaluation.evaluation_settings import EvaluationSettings
 from geomocap.evaluation.marker_track import MarkerTrack
 from geomocap.evaluation.result import Alignment, EvaluationError
+from geomocap.model.rotations import rigid_motion
 
 Pairs = list[tuple[int, int]]
 
@@ -116,19 +117,6 @@ def _fit_at(
             break
         fit, alignment = again, again.alignment
     return replace(fit, alignment=alignment)
-
-
-def rigid_motion(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation and translation that take `source` to `target`, (N, 3) each, in the weighted least squares sense.
-
-    Kabsch (1976); the determinant is kept positive, so a mirrored world stays an error.
-    """
-    w = weights / weights.sum()
-    a, b = w @ source, w @ target
-    u, _, vt = np.linalg.svd((source - a).T @ ((target - b) * w[:, None]))
-    sign = np.sign(np.linalg.det(vt.T @ u.T))
-    R = vt.T @ np.diag([1, 1, sign]) @ u.T
-    return R, b - R @ a
 
 
 def candidate_offsets(found: np.ndarray, times: np.ndarray, track: MarkerTrack, largest: float) -> list[float]:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomocap.errors import GeometryError
+from geomocap.model.rotations import rigid_motion
 from geomocap.model.trajectories import Trajectories
 
 REACH = 4.0
@@ -168,14 +169,11 @@ def _fit(local: np.ndarray, world: np.ndarray, variance: np.ndarray, last_turn: 
     """Fit world = R local + t robustly, and return it with the misfits (N,). With fewer than three points R stays."""
     weight, turn = 1 / variance, last_turn
     for _ in range(6):
-        total = weight.sum()
-        a, b = weight @ local / total, weight @ world / total
         if len(local) >= _LEAST:
             # the last turn steadies directions that the points hardly determine
-            spread = ((world - b) * weight[:, None]).T @ (local - a) + _STEADY**2 * total * last_turn
-            U, _, Vt = np.linalg.svd(spread)
-            turn = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-        place = b - turn @ a
+            turn, place = rigid_motion(local, world, weight, prior=_STEADY**2 * last_turn)
+        else:
+            place = weight @ (world - local @ turn.T) / weight.sum()
         miss = np.linalg.norm(world - local @ turn.T - place, axis=1)
         weight = 1 / (variance + miss**2)
     # trajectories all on one side share what the skin between does

@@ -1,62 +1,8 @@
-"""How far each body has turned since the first frame."""
+"""Rotations: the one nearest to a matrix, the rigid motion between points, and how far matrices turn."""
 
 from __future__ import annotations
 
 import numpy as np
-
-from geomocap.model.ellipsoids import SHELL, Ellipsoids
-
-_AXES = 1.0
-_INERTIA = 0.3
-
-
-def body_rotations(ellipsoids: Ellipsoids, body: np.ndarray, bodies: Ellipsoids) -> np.ndarray:
-    """Rotation of each body since frame 0, continuous over time.
-
-    The rotation is the one nearest (weighted Kabsch) to three pieces of evidence, summed as correlation matrices:
-    the centres of the body's small ellipsoids about their mean, weighted by their points; the first and the last axis
-    of the ellipsoid of the whole body, signs resolved to the frame before, weighted by how much they differ from the
-    middle axis, so that nothing jumps when axes change places; and, weakly, the rotation of the frame before, which
-    decides what the others leave open, as the roll of a round limb.
-
-    Parameters
-    ----------
-    ellipsoids : Ellipsoids (T, K)
-    body : (K,) int
-        Body of each ellipsoid.
-    bodies : Ellipsoids (T, B)
-        Ellipsoids of the bodies.
-
-    Returns
-    -------
-    (T, B, 3, 3) float
-        Proper rotations about world axes, the identity in frame 0.
-    """
-    frames, count = bodies.counts.shape
-    result = np.tile(np.eye(3), (frames, count, 1, 1))
-    variances = bodies.radii**2 / SHELL
-    for b in range(count):
-        members = np.flatnonzero(body == b)
-        weights = ellipsoids.counts[:, members].astype(float).mean(axis=0)
-        weights /= weights.sum()
-        centers = ellipsoids.centers[:, members]
-        centers = centers - np.einsum("tkc,k->tc", centers, weights)[:, None]
-        first = bodies.rotations[0, b]
-        for t in range(1, frames):
-            before = result[t - 1, b]
-            evidence = np.einsum("ki,kj,k->ij", centers[t], centers[0], weights)
-            for axis, neighbour in ((0, 1), (2, 1)):
-                now = bodies.rotations[t, b, :, axis]
-                start = first[:, axis]
-                strength = min(
-                    abs(variances[t, b, axis] - variances[t, b, neighbour]),
-                    abs(variances[0, b, axis] - variances[0, b, neighbour]),
-                )
-                sign = 1.0 if now @ before @ start >= 0.0 else -1.0
-                evidence += _AXES * strength * sign * np.outer(now, start)
-            evidence += _INERTIA * variances[0, b].sum() * before
-            result[t, b] = nearest_rotation(evidence)
-    return result
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
@@ -64,3 +10,41 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     u, _, vt = np.linalg.svd(matrix)
     u[..., 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[..., None]
     return u @ vt
+
+
+def rigid_motion(
+    source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None, prior: np.ndarray | float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations and translations that take points to others in the weighted least squares sense.
+
+    The rotations are proper even if the points are mirrored: a mirrored world stays an error.
+
+    Parameters
+    ----------
+    source, target : (…, N, 3) float
+        They may be broadcast against each other.
+    weights : (…, N) float, optional
+        All the same if not given.
+    prior : (…, 3, 3) float, optional
+        Rotations times squared lengths, added to the points' second moments (of mean weight 1): they decide what the
+        points leave open.
+
+    Returns
+    -------
+    rotations : (…, 3, 3) float
+    translations : (…, 3) float
+        target = rotation @ source + translation.
+    """
+    if weights is None:
+        weights = np.ones(target.shape[:-1])
+    fraction = weights / weights.sum(axis=-1, keepdims=True)
+    start, end = ((fraction[..., None, :] @ x)[..., 0, :] for x in (source, target))
+    moment = np.swapaxes((target - end[..., None, :]) * fraction[..., None], -1, -2) @ source
+    rotations = nearest_rotation(moment + prior)
+    return rotations, end - (rotations @ start[..., None])[..., 0]
+
+
+def turn_angles(rotations: np.ndarray) -> np.ndarray:
+    """Angles of rotation matrices (…, 3, 3), radians."""
+    cosine = (np.trace(rotations, axis1=-2, axis2=-1) - 1.0) / 2.0
+    return np.arccos(np.clip(cosine, -1.0, 1.0))

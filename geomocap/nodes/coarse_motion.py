@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from geomocap.nodes.anchors import AnchorPoints, find_homes
 from geomocap.nodes.correspondences import Pull, Target, pull
-from geomocap.nodes.deformation import BlockPattern, block_pattern, rotation_of, step, vector_of
+from geomocap.nodes.deformation import BlockPattern, block_pattern, step
 from geomocap.nodes.extremities import match_ends
 from geomocap.nodes.node_graph import NodeGraph
 from geomocap.nodes.node_settings import NodeTrackingSettings
@@ -118,14 +119,14 @@ class CoarseModel:
 
     def between(self, last: State, following: State) -> State:
         """Halfway between two states, made as rigid as can be."""
-        half = vector_of(following.R @ last.R.transpose(0, 2, 1)) / 2
-        return self._relaxed((last.x + following.x) / 2, rotation_of(half) @ last.R)
+        half = Rotation.from_matrix(following.R @ last.R.transpose(0, 2, 1)).as_rotvec() / 2
+        return self._relaxed((last.x + following.x) / 2, Rotation.from_rotvec(half).as_matrix() @ last.R)
 
     def expected(self, last: State, before: State) -> State:
         """Go on with the motion of the last frame, made as rigid as can be."""
         m = self.settings.momentum
-        turn = vector_of(last.R @ before.R.transpose(0, 2, 1))
-        return self._relaxed(last.x + m * (last.x - before.x), rotation_of(m * turn) @ last.R)
+        turn = Rotation.from_matrix(last.R @ before.R.transpose(0, 2, 1)).as_rotvec()
+        return self._relaxed(last.x + m * (last.x - before.x), Rotation.from_rotvec(m * turn).as_matrix() @ last.R)
 
     def _relaxed(self, x: np.ndarray, R: np.ndarray) -> State:
         hold = np.tile(0.05 * np.eye(3), (len(self.graph.samples), 1, 1))

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from scipy.spatial.transform import Rotation
 
 from geomocap.nodes.node_graph import NodeGraph
 
@@ -240,25 +241,6 @@ def solve_blocks(H, g, start, column, diagonal, iterations, tolerance):
     return z
 
 
-def rotation_of(turn: np.ndarray) -> np.ndarray:
-    """Rotation matrices (N, 3, 3) of rotation vectors (N, 3), radians (Rodrigues)."""
-    angle = np.linalg.norm(turn, axis=1)
-    axis = turn / np.maximum(angle, 1e-12)[:, None]
-    K = np.zeros((len(turn), 3, 3))
-    K[:, 0, 1], K[:, 0, 2], K[:, 1, 2] = -axis[:, 2], axis[:, 1], -axis[:, 0]
-    K -= K.transpose(0, 2, 1)
-    s, c = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    return np.eye(3) + s * K + (1 - c) * (K @ K)
-
-
-def vector_of(R: np.ndarray) -> np.ndarray:
-    """Rotation vectors (N, 3), radians, of rotation matrices (N, 3, 3); exact but for turns near 180°."""
-    w = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1) / 2
-    sine = np.linalg.norm(w, axis=1)
-    angle = np.arctan2(sine, (np.trace(R, axis1=1, axis2=2) - 1) / 2)
-    return w * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 1.0)[:, None]
-
-
 def step(
     graph: NodeGraph,
     pattern: BlockPattern,
@@ -303,4 +285,4 @@ def step(
     turn = z[:, :3]
     # no node turns by more than half a radian in one step: the linearisation ends there
     much = np.maximum(np.linalg.norm(turn, axis=1, keepdims=True) / 0.5, 1.0)
-    return x + z[:, 3:], rotation_of(turn / much) @ R
+    return x + z[:, 3:], Rotation.from_rotvec(turn / much).as_matrix() @ R

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.rotations import nearest_rotation
 from geomocap.nodes.anchors import AnchorPoints
 from geomocap.nodes.coarse_motion import CoarseModel, CoarseTarget, State, follow, mend
 from geomocap.nodes.correspondences import Target, pull
@@ -148,7 +149,7 @@ class NodeModel:
         moved = coarse.x[self.carrier] + np.matmul(coarse.R[self.carrier], arm[..., None])[..., 0]
         w = self.carrier_weights
         x = (w[..., None] * moved).sum(axis=1)
-        R = _nearest_rotations((w[..., None, None] * coarse.R[self.carrier]).sum(axis=1))
+        R = nearest_rotation((w[..., None, None] * coarse.R[self.carrier]).sum(axis=1))
         h, s, g = self.graph.spacing, self.settings, self.graph
         target = replace(target, points=target.points.turned_like(*g.deform(x, R), 0.5 * h))
         marks = AnchorPoints.of(g, homes, anchors)
@@ -172,12 +173,6 @@ class NodeModel:
             self.patches, normals, found.support, found.across, s.slide * h, s.noise * h, anchored
         )
         return x, R, covariance, support < s.lost_below
-
-
-def _nearest_rotations(M: np.ndarray) -> np.ndarray:
-    U, _, Vt = np.linalg.svd(M)
-    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-    return U @ Vt
 
 
 def track_nodes(

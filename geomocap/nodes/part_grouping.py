@@ -13,8 +13,7 @@ import heapq
 from dataclasses import dataclass
 
 import numpy as np
-
-from geomocap.nodes.deformation import rotation_of, vector_of
+from scipy.spatial.transform import Rotation
 
 _FRAMES = 0.95  # a part must move as one in this fraction of the frames; in the others it may have been lost
 
@@ -137,7 +136,7 @@ def twist_of(R: np.ndarray, t: np.ndarray, to_R: np.ndarray, to_t: np.ndarray) -
     """Twists (…, 6), turn and shift, that take motions (R, t) to (to_R, to_t), by the logarithm of SE(3)."""
     turn = to_R @ R.swapaxes(-1, -2)
     shift = to_t - (turn @ t[..., None])[..., 0]
-    w = vector_of(turn.reshape(-1, 3, 3)).reshape(t.shape)
+    w = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(t.shape)
     angle = np.linalg.norm(w, axis=-1)
     half = angle / 2
     # 1/a² (1 − a/2 · cot a/2), which tends to 1/12
@@ -156,4 +155,4 @@ def motion_of(twist: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     first = np.where(angle > 1e-3, (1 - np.cos(safe)) / safe**2, 0.5)[:, None]
     second = np.where(angle > 1e-3, (safe - np.sin(safe)) / safe**3, 1.0 / 6.0)[:, None]
     once = np.cross(w, v)
-    return rotation_of(w), v + first * once + second * np.cross(w, once)
+    return Rotation.from_rotvec(w).as_matrix(), v + first * once + second * np.cross(w, once)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from geomocap.model.rotations import rigid_motion
+
 
 @dataclass(frozen=True)
 class RigidParts:
@@ -157,10 +159,5 @@ def part_motions(label: np.ndarray, nodes: np.ndarray, x: np.ndarray, R: np.ndar
     turns, shifts = np.empty((B, T, 3, 3)), np.empty((B, T, 3))
     for b in range(B):
         own = label == b
-        start, middle = nodes[own].mean(axis=0), x[own].mean(axis=0)
-        moment = np.einsum("ntc,nd->tcd", x[own] - middle, nodes[own] - start) + arm**2 * R[own].sum(axis=0)
-        U, _, Vt = np.linalg.svd(moment)
-        U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-        turns[b] = U @ Vt
-        shifts[b] = middle - turns[b] @ start
+        turns[b], shifts[b] = rigid_motion(nodes[own], x[own].swapaxes(0, 1), prior=arm**2 * R[own].mean(axis=0))
     return RigidParts(label, turns, shifts, np.zeros(B, bool))

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.sparse import csr_matrix, diags, identity
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from geomocap.nodes.correspondences import Target, pull
-from geomocap.nodes.deformation import rotation_of
 from geomocap.nodes.node_graph import NodeGraph
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.nodes.part_grouping import MotionForms, group_nodes
@@ -250,7 +250,7 @@ class PartTracker:
             step = np.zeros((len(R), 6))
             step.ravel()[free] = np.linalg.solve((H + np.diag(damping.ravel()))[np.ix_(free, free)], b.ravel()[free])
             much = np.maximum(np.linalg.norm(step[:, :3], axis=1, keepdims=True) / 0.5, 1.0)
-            turn = rotation_of(step[:, :3] / much)
+            turn = Rotation.from_rotvec(step[:, :3] / much).as_matrix()
             t = (turn @ (t - middle)[..., None])[..., 0] + middle + step[:, 3:]
             R = turn @ R
         return R, t

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.linalg import spsolve
 
+from geomocap.model.rotations import nearest_rotation
 from geomocap.model.trajectories import Trajectories
 from geomocap.trajectories.completion import nearest_companions
 
@@ -113,9 +114,7 @@ def _rotations(positions: np.ndarray, shape: _Shape, edges: np.ndarray, depth_st
     w = 1 / (1 + (shape.spread[edges] / (_LOOSE * depth_std)) ** 2)
     products = ((positions[j] - positions[i]) * w[:, None])[:, :, None] * shape.offset[edges][:, None, :]
     gather = csr_matrix((np.ones(len(i)), (i, np.arange(len(i)))), (len(positions), len(i)))
-    u, _, vt = np.linalg.svd((gather @ products.reshape(len(i), 9)).reshape(-1, 3, 3))
-    u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
-    return u @ vt
+    return nearest_rotation((gather @ products.reshape(len(i), 9)).reshape(-1, 3, 3))
 
 
 def _weights(

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
+from geomocap.model.rotations import rigid_motion
 from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.seeding import patch_shape, spread, surface_frames
 from geomocap.patches.surface_patches import (
@@ -376,18 +377,13 @@ def rigid_motions(
     arm : float, metres
         A frame counts as three points so far from its place.
     """
-    a = np.concatenate([X[:, None], X[:, None] + arm * Q.swapaxes(1, 2)], axis=1)
-    b = np.concatenate([Y[:, :, None], Y[:, :, None] + arm * S.swapaxes(2, 3)], axis=2)
+    a = np.concatenate([X[:, None], X[:, None] + arm * Q.swapaxes(1, 2)], axis=1).reshape(-1, 3)
+    b = np.concatenate([Y[:, :, None], Y[:, :, None] + arm * S.swapaxes(2, 3)], axis=2).reshape(len(Y), -1, 3)
     robust = np.ones_like(weight)
     for _ in range(4):
-        w = weight * robust
-        w /= 4 * w.sum(axis=1, keepdims=True)
-        start, end = np.einsum("km,mpi->ki", w, a), np.einsum("km,kmpi->ki", w, b)
-        U, _, Vt = np.linalg.svd(np.einsum("km,kmpi,mpj->kij", w, b - end[:, None, None], a))
-        U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-        turns = U @ Vt
-        shifts = end - (turns @ start[:, :, None])[:, :, 0]
-        off = np.linalg.norm(np.einsum("kij,mpj->kmpi", turns, a) + shifts[:, None, None] - b, axis=3).mean(axis=2)
+        turns, shifts = rigid_motion(a, b, np.repeat(weight * robust, 4, axis=1))
+        off = np.linalg.norm(a @ turns.swapaxes(1, 2) + shifts[:, None] - b, axis=2)
+        off = off.reshape(*weight.shape, 4).mean(axis=2)
         typical = np.maximum(np.median(off, axis=1, keepdims=True), 0.1 * arm)
         robust = 1 / (1 + (off / (2 * typical)) ** 2) ** 2
     return turns, shifts

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomocap.bodies.rigid_motions import turn_angles
-from geomocap.model.rotations import nearest_rotation
+from geomocap.model.rotations import nearest_rotation, turn_angles
 
 _ROUNDS = 6
 _INDEPENDENT = 0.2  # fraction of the frames; neighbouring ones err together

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from geomocap.bodies.rigid_motions import fit_rigid_motion, turn_angles
+from geomocap.bodies.rigid_motions import fit_rigid_motion
 from geomocap.model.motion_paths import MotionPaths
-from geomocap.model.rotations import nearest_rotation
+from geomocap.model.rotations import nearest_rotation, turn_angles
 from geomocap.skeleton.body_observations import SkinPoints
 from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, joint_motion
 from geomocap.subject.subject_model import SubjectModel

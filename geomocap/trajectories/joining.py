@@ -7,6 +7,7 @@ from dataclasses import fields
 import numpy as np
 from scipy.spatial import cKDTree
 
+from geomocap.model.rotations import nearest_rotation
 from geomocap.model.trajectories import Trajectories
 
 _NEAR = 0.75  # of the typical distance of neighbours: nearer than patches are placed
@@ -51,7 +52,7 @@ def join_broken(tracks: Trajectories) -> Trajectories:
         if spread > _STEADY * typical:
             continue
         alive[j] = False
-        between = _mean_rotation(np.swapaxes(turn[common], 1, 2) @ arrays["rotations"][i, common])
+        between = nearest_rotation((np.swapaxes(turn[common], 1, 2) @ arrays["rotations"][i, common]).sum(axis=0))
         arrays["positions"][i, extra] = arrays["positions"][j, extra] + turn[extra] @ middle
         arrays["rotations"][i, extra] = turn[extra] @ between
         arrays["sigma"][i, extra] = np.hypot(arrays["sigma"][j, extra], spread / np.sqrt(3))
@@ -81,9 +82,3 @@ def _near_pairs(tracks: Trajectories, distance: float) -> np.ndarray:
             pairs = cKDTree(tracks.positions[rows, t]).query_pairs(distance, output_type="ndarray")
             found.append(np.sort(rows[pairs], axis=1))
     return np.unique(np.concatenate(found), axis=0)
-
-
-def _mean_rotation(rotations: np.ndarray) -> np.ndarray:
-    """Chordal mean of rotations (N, 3, 3)."""
-    u, _, vt = np.linalg.svd(rotations.sum(axis=0))
-    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt

@@ -6,9 +6,9 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from geomocap.bodies.motion_bodies import MotionBodiesSettings, find_motion_bodies
-from geomocap.bodies.rigid_motions import turn_angles
 from geomocap.model.hierarchy import Hierarchy
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.rotations import turn_angles
 from geomocap.skeleton.adjustment_kernel import normal_equations
 from geomocap.skeleton.articulated_adjustment import JointPrior, _system, adjust
 from geomocap.skeleton.body_observations import Observations, SkinPoints

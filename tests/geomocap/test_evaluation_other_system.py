@@ -4,7 +4,6 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from geomocap.evaluation import EvaluationSettings, evaluate
-from geomocap.evaluation.alignment import rigid_motion
 from geomocap.evaluation.marker_track import MarkerTrack
 from geomocap.evaluation.other_system import compare_markers, match_by_distance, read_matches
 from geomocap.evaluation.result import EvaluationError
@@ -13,6 +12,7 @@ from geomocap.export.markers import Markers
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.trc import write_trc
 from geomocap.files.run import Run
+from geomocap.model.rotations import rigid_motion
 from tests.geomocap.articulated import skeleton_arrays
 
 OFFSET = 0.37

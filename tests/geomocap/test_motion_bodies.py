@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 from geomocap.bodies.body_criteria import fixed_fraction, may_be_joined
 from geomocap.bodies.motion_bodies import MotionBodiesSettings, find_motion_bodies
 from geomocap.bodies.point_labels import label_points
-from geomocap.bodies.rigid_motions import turn_angles
 from geomocap.errors import GeometryError
 from geomocap.model.hierarchy import Hierarchy
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.rotations import turn_angles
 from geomocap.pipeline.motion_stage import unsure_turns
 from geomocap.skeleton.articulated_motion import fit_articulated, prior_moments
 from geomocap.skeleton.borders import Border

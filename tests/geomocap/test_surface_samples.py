@@ -7,10 +7,11 @@ from scipy.spatial.transform import Rotation
 
 from geomocap.bodies.connected_linkage import connected_linkage
 from geomocap.bodies.local_rotations import local_rotations, turn_distances
-from geomocap.bodies.rigid_motions import fit_rigid_motion, turn_angles
+from geomocap.bodies.rigid_motions import fit_rigid_motion
 from geomocap.bodies.skin_blending import explain
 from geomocap.bodies.surface_graph import bridges, lasting_distances, surface_graph
 from geomocap.model.motion_paths import sure_part
+from geomocap.model.rotations import turn_angles
 
 
 def test_lasting_distances_are_the_third_largest():

@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geomocap.bodies.rigid_motions import turn_angles
 from geomocap.config import Config
 from geomocap.errors import GeometryError
 from geomocap.files.run import Run
 from geomocap.files.scans import open_scans
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.rotations import turn_angles
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.segmentation_stage import segment
 from geomocap.scheduling import threads
