@@ -86,11 +86,7 @@ def hinge_axis(turns: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, 
     information : (T, 3, 3) float
         Of each.
     """
-    weight = np.trace(information, axis1=1, axis2=2)
-    vectors = Rotation.from_matrix(turns).as_rotvec()
-    half = np.sin(0.5 * np.linalg.norm(vectors, axis=1))[:, None] * _directions(vectors)
-    axis = np.linalg.eigh(np.einsum("t,ti,tj->ij", weight, half, half))[1][:, 2]
-    axis = axis * (1.0 if axis[np.argmax(np.abs(axis))] > 0 else -1.0)
+    axis = main_axis(turns, np.trace(information, axis1=1, axis2=2))
     for _ in range(_ROUNDS):
         off = _off_axis(turns, axis)
         across = np.linalg.svd(axis[None])[2][1:]
@@ -102,13 +98,16 @@ def hinge_axis(turns: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, 
     return axis, _off_axis(turns, axis)
 
 
+def main_axis(turns: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Axis of the largest moment of turns (T, 3, 3), by the sines of half their angles, with weights (T,): (3,)."""
+    half = Rotation.from_matrix(turns).as_quat(canonical=True)[:, :3]
+    axis = np.linalg.eigh(np.einsum("t,ti,tj->ij", weights, half, half))[1][:, 2]
+    return axis * (1.0 if axis[np.argmax(np.abs(axis))] > 0 else -1.0)
+
+
 def _tilted(axis: np.ndarray, across: np.ndarray) -> np.ndarray:
     return np.cos(_TILT) * axis + np.sin(_TILT) * across
 
 
 def _off_axis(turns: np.ndarray, axis: np.ndarray) -> np.ndarray:
     return Rotation.from_matrix(turns @ np.swapaxes(about_axis(turns, axis), 1, 2)).as_rotvec()
-
-
-def _directions(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)

@@ -13,17 +13,14 @@ from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.errors import GeometryError
 from geomocap.model.hierarchy import Hierarchy
 from geomocap.settings import Settings
-from geomocap.skeleton.articulated_motion import fit_articulated, prior_moments
+from geomocap.skeleton.articulated_adjustment import adjust
+from geomocap.skeleton.body_observations import Observations, SkinPoints
 from geomocap.skeleton.bone_motion import local_rotations
 from geomocap.skeleton.borders import Border, contacts, find_borders
 from geomocap.skeleton.common_points import CommonPoint, common_point
+from geomocap.skeleton.kinematics import BodyMotion, Linkage, joint_motion
 from geomocap.skeleton.m3_skeleton import Skeleton
 from geomocap.skeleton.spanning_tree import Connection, connect_by_cost, connection_cost
-from geomocap.skeleton.temporal_smoothing import smooth_positions, smooth_rotations
-
-_UNSEEN = 0.05
-_BRIDGE = 1e-3
-_LEAST_MISS = 5e-4  # diagonals
 
 
 class MotionSkeletonSettings(Settings):
@@ -34,9 +31,6 @@ class MotionSkeletonSettings(Settings):
         gt=0,
         description="least weight of the place where bodies touch (frames in which they turn by a radian)",
     )
-    hinge_fraction: float = Field(
-        default=0.1, ge=0, lt=1, description="hinge: turns about other axes are less than this fraction of all (0..1)"
-    )
     interface_weight: float = Field(
         default=0.05, ge=0, description="tree: weight of a joint's distance from where its bodies touch (no unit)"
     )
@@ -45,10 +39,6 @@ class MotionSkeletonSettings(Settings):
         default=0.01, ge=0, description="tree: cost of bodies without common border (diagonals)"
     )
     largest_gap: float = Field(default=0.1, gt=0, description="bodies farther apart are not connected (diagonals)")
-    smoothing: float = Field(
-        default=0.0, ge=0, description="weight of an even pace against the samples; 1 halves what changes in 3 frames"
-    )
-    rounds: int = Field(default=6, ge=1, description="rounds of the fit that keeps joints together")
 
 
 @dataclass(frozen=True)
@@ -62,11 +52,14 @@ class MotionSkeleton:
         In the order of the skeleton's joints.
     costs : (J,) float, metres
         What each connection cost.
+    borders : tuple of Border
+        Where the two bodies of each joint touch.
     """
 
     skeleton: Skeleton
     joints: tuple[CommonPoint, ...]
     costs: np.ndarray
+    borders: tuple[Border, ...]
 
 
 def find_motion_skeleton(
@@ -96,30 +89,33 @@ def find_motion_skeleton(
     # The tree
     hierarchy, chosen = connect_by_cost(connections, count, sizes)
     joints = np.array([c.joint.point for c in chosen]).reshape(-1, 3)
-    # Bones that keep their length
+    # Bodies that hang on each other
     middle = np.stack([bodies.rest[bodies.label == b].mean(axis=0) for b in range(count)])
-    spread = [np.sqrt(((bodies.rest[bodies.label == b] - middle[b]) ** 2).sum(axis=1).mean()) for b in range(count)]
-    weights = bodies.reliability * sizes * len(bodies.label) + 1e-3
-    turned, moved = _smooth_motion(bodies, middle, settings.smoothing)
-    moments = prior_moments(turned, moved, middle, np.array(spread), weights)
-    motion = fit_articulated(moments, hierarchy, joints, turned, settings.rounds)
+    axes = np.array([c.joint.axis for c in chosen]).reshape(-1, 3)
+    linkage = Linkage(hierarchy, joints, axes, np.zeros(len(joints), bool), middle[hierarchy.root])
+    motion = _connected_motion(linkage, bodies, middle)
     centers = np.einsum("tbij,bj->tbi", motion.rotations, middle) + motion.translations
-    skeleton = skeleton_of_motion(hierarchy, joints, motion.rotations, motion.joint_positions, centers, middle, fps)
-    return MotionSkeleton(skeleton, tuple(c.joint for c in chosen), np.array([c.cost for c in chosen]))
+    places = linkage.joint_positions(motion)
+    skeleton = skeleton_of_motion(hierarchy, joints, motion.rotations, places, centers, middle, fps)
+    costs = np.array([c.cost for c in chosen])
+    return MotionSkeleton(skeleton, tuple(c.joint for c in chosen), costs, tuple(c.border for c in chosen))
 
 
-def _smooth_motion(bodies: MotionBodies, middle: np.ndarray, strength: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations and translations of all bodies, smooth in time; frames without samples are bridged."""
-    rotations, translations = bodies.rotations.copy(), bodies.translations.copy()
-    for b in range(bodies.body_count):
-        weights = bodies.reliability[:, b] / max(float(bodies.reliability[:, b].max()), 1e-9)
-        # where nothing is seen the motion is bridged in any case
-        bridged = strength if strength > 0 else (_BRIDGE if (weights < _UNSEEN).any() else 0.0)
-        weights = np.where(weights < _UNSEEN, 0.0, weights)
-        rotations[:, b] = smooth_rotations(bodies.rotations[:, b], weights, bridged)
-        path = smooth_positions(bodies.centers[:, b], weights, bridged, _LEAST_MISS * bodies.diagonal)
-        translations[:, b] = path - rotations[:, b] @ middle[b]
-    return rotations, translations
+def _connected_motion(linkage: Linkage, bodies: MotionBodies, middle: np.ndarray) -> BodyMotion:
+    """Motion of connected bodies nearest to what each does by itself, as if each were six of its points."""
+    count = bodies.body_count
+    members = [bodies.rest[bodies.label == b] for b in range(count)]
+    radii = np.array([np.sqrt(((m - c) ** 2).sum(axis=1).mean()) for m, c in zip(members, middle, strict=True)])
+    ends = np.concatenate([np.eye(3), -np.eye(3)])
+    rest = (middle[:, None] + radii[:, None, None] * ends).reshape(-1, 3)
+    own = np.repeat(np.arange(count), len(ends))
+    points = SkinPoints.of_weights(rest, np.eye(count)[own])
+    targets = BodyMotion(bodies.rotations, bodies.translations).carry(rest, points.bodies, points.fractions)
+    weights = bodies.reliability * [len(m) for m in members] + 1e-3
+    sigma = bodies.diagonal / np.sqrt(weights)  # far above all misses: plain least squares
+    observations = Observations.of_paths(targets.swapaxes(0, 1), sigma.T[own])
+    start = joint_motion(linkage, bodies.rotations, bodies.centers[:, linkage.hierarchy.root])
+    return adjust(linkage, start, points, observations).bodies
 
 
 def possible_connections(bodies: MotionBodies, settings: MotionSkeletonSettings) -> list[Connection]:
@@ -141,17 +137,11 @@ def possible_connections(bodies: MotionBodies, settings: MotionSkeletonSettings)
             (bodies.translations[:, a], bodies.translations[:, b]),
         )
         reliability = np.minimum(bodies.reliability[:, a], bodies.reliability[:, b]) + 1e-3
-        interface = border.middle
-        certainty = (settings.interface_prior, border.spread, noise, settings.hinge_fraction)
-        joint = common_point(*motions, reliability, interface, *certainty)
-        if joint.hinge:
-            # every point of its axis is common: the joint is in the middle of what the bodies fraction of it
-            interface = border.middle_along(joint.point, joint.axis)
-            joint = common_point(*motions, reliability, interface, *certainty)
-        off = float(np.linalg.norm(joint.point - interface))
+        joint = common_point(*motions, reliability, border.middle, settings.interface_prior, border.spread, noise)
+        off = float(np.linalg.norm(joint.point - border.middle))
         fraction = float(contact[a, b] / min(whole[a], whole[b]))
         cost = connection_cost(joint.miss, off, border.gap, fraction, weights)
-        result.append(Connection((a, b), joint, interface, border.gap, cost))
+        result.append(Connection((a, b), joint, border, cost))
     return result
 
 

@@ -13,6 +13,7 @@ from geomocap.settings import Settings
 from geomocap.skeleton.articulated_adjustment import JointPrior, adjust
 from geomocap.skeleton.body_observations import Observations, SkinPoints
 from geomocap.skeleton.bone_motion import fit_offsets, forward_kinematics, local_rotations
+from geomocap.skeleton.borders import Border
 from geomocap.skeleton.hinges import find_hinges, turn_information
 from geomocap.skeleton.kinematics import (
     BodyMotion,
@@ -34,9 +35,7 @@ _SETTLE_ROUNDS = 3
 class RefinementSettings(Settings):
     """How the motion of connected bodies is refined over all frames."""
 
-    rounds: int = Field(
-        default=3, ge=0, description="rounds of skin weights, shape, and motion with joints; 0: no refinement"
-    )
+    rounds: int = Field(default=3, ge=1, description="rounds of skin weights, shape, and motion with joints")
     steps: int = Field(default=4, ge=1, description="steps of each adjustment of motion and joints")
     independence: float = Field(
         default=0.3, gt=0, le=1, description="fraction of the observations that err independently of each other (0..1)"
@@ -117,13 +116,11 @@ def refine_skeleton(
     MotionBodies
         With refined motion, rest and weights; labels stay.
     """
-    settings = settings or RefinementSettings()
-    if settings.rounds == 0:
-        return found, bodies
     linkage, motion = linkage_of(found)
     points = SkinPoints.of_weights(bodies.rest, bodies.weights)
     misses = np.array([joint.miss for joint in found.joints])
     refined = refine_motion(linkage, motion, points, paths, bodies.diagonal, settings, misses)
+    refined = replace(refined, linkage=_slid(refined.linkage, found.borders))
     bodies = replace(
         bodies,
         weights=refined.points.weights(bodies.body_count),
@@ -147,7 +144,16 @@ def refine_skeleton(
             found.joints, places[0], refined.linkage.axes, refined.linkage.hinge, strict=True
         )
     )
-    return MotionSkeleton(skeleton, joints, found.costs), bodies
+    return replace(found, skeleton=skeleton, joints=joints), bodies
+
+
+def _slid(linkage: Linkage, borders: tuple[Border, ...]) -> Linkage:
+    """Linkage in whose hinges the joints are where the bodies' shapes say: the motion leaves open where on the axis."""
+    places = [
+        border.middle_along(joint, axis) if hinge else joint
+        for joint, axis, hinge, border in zip(linkage.joints, linkage.axes, linkage.hinge, borders, strict=True)
+    ]
+    return replace(linkage, joints=np.array(places).reshape(-1, 3))
 
 
 def linkage_of(found: MotionSkeleton) -> tuple[Linkage, JointMotion]:

@@ -9,6 +9,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 
 from geomocap.model.hierarchy import Hierarchy
+from geomocap.skeleton.borders import Border
 from geomocap.skeleton.common_points import CommonPoint
 
 
@@ -20,17 +21,14 @@ class Connection:
     ----------
     bodies : tuple of two int
     joint : CommonPoint
-    interface : (3,) float, metres
-        Where they touch in frame 0.
-    gap : float, metres
-        Lasting distance of their nearest samples.
+    border : Border
+        Where they touch.
     cost : float, metres
     """
 
     bodies: tuple[int, int]
     joint: CommonPoint
-    interface: np.ndarray
-    gap: float
+    border: Border
     cost: float
 
 

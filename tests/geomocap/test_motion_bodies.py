@@ -9,15 +9,13 @@ from geomocap.bodies.body_criteria import fixed_fraction, may_be_joined
 from geomocap.bodies.motion_bodies import MotionBodiesSettings, find_motion_bodies
 from geomocap.bodies.point_labels import label_points
 from geomocap.errors import GeometryError
-from geomocap.model.hierarchy import Hierarchy
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.rotations import turn_angles
 from geomocap.pipeline.motion_stage import unsure_turns
-from geomocap.skeleton.articulated_motion import fit_articulated, prior_moments
 from geomocap.skeleton.borders import Border
 from geomocap.skeleton.common_points import common_point
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
-from geomocap.skeleton.temporal_smoothing import smooth_positions, smooth_rotations
+from geomocap.skeleton.refinement import refine_skeleton
 from geomocap.trajectories.completion import complete_tracks
 from tests.geomocap.moving_chains import chain, same_partition, seen_by_single_cameras
 
@@ -208,7 +206,7 @@ def test_broken_paths_give_the_same_bodies(three):
 
 
 def test_joints_hinges_and_tree_of_a_chain(three, found):
-    result = find_motion_skeleton(found, 30.0)
+    result, _ = refine_skeleton(find_motion_skeleton(found, 30.0), found, MotionPaths(three.positions))
     skeleton = result.skeleton
     assert len(skeleton.joint_positions[0]) == 2
     # the middle body is connected to both others
@@ -257,50 +255,6 @@ def test_joints_stay_fixed_in_both_bodies_and_follow_forward_kinematics(found):
     np.testing.assert_allclose(between, between[0], atol=1e-9)
 
 
-def test_smoothing_takes_away_jitter_without_lag():
-    rng = np.random.default_rng(2)
-    angles = 0.7 * np.sin(np.arange(60) / 9.0)
-    true = Rotation.from_rotvec(angles[:, None] * np.array([0.6, 0.0, 0.8])).as_matrix()
-    noisy = true @ Rotation.from_rotvec(rng.normal(scale=0.03, size=(60, 3))).as_matrix()
-    noisy[31] = np.eye(3)  # an outlier
-    smooth = smooth_rotations(noisy, np.ones(60), 20.0)
-    inner = np.delete(np.arange(5, 55), 26)
-    miss = turn_angles(smooth.swapaxes(1, 2) @ true)
-    assert miss[inner].mean() < 0.6 * turn_angles(noisy.swapaxes(1, 2) @ true)[inner].mean()
-    assert miss[31] < 0.06
-    before = turn_angles(true[:-1].swapaxes(1, 2) @ smooth[1:]).mean()
-    after = turn_angles(true[1:].swapaxes(1, 2) @ smooth[:-1]).mean()
-    assert abs(before - after) < 0.1 * max(before, after)
-    path = np.stack([np.sin(np.arange(60) / 9.0)] * 3, axis=1)
-    jumpy = path + rng.normal(scale=0.02, size=path.shape)
-    assert np.abs(smooth_positions(jumpy, np.ones(60), 20.0, 1e-3) - path).mean() < 0.6 * np.abs(jumpy - path).mean()
-
-
-def test_frames_without_samples_are_bridged():
-    true = Rotation.from_rotvec(0.7 * np.sin(np.arange(40) / 9.0)[:, None] * np.array([0.6, 0.0, 0.8])).as_matrix()
-    broken = true.copy()
-    broken[18:24] = np.eye(3)
-    weights = np.ones(40)
-    weights[18:24] = 0.0
-    bridged = smooth_rotations(broken, weights, 1e-3)
-    assert np.rad2deg(turn_angles(bridged.swapaxes(1, 2) @ true)).max() < 1.0
-
-
-def test_connected_bodies_keep_their_joints_and_come_near_the_samples():
-    moving = chain(3, frames=12, turn_deg=30.0)
-    middle = np.array([[0.2, 0, 0], [0.6, 0, 0], [1.0, 0, 0]])
-    moments = prior_moments(moving.rotations, moving.translations, middle, np.full(3, 0.1), np.full((12, 3), 40.0))
-    tree = Hierarchy(1, np.array([[1, 0], [1, 2]], np.int32))
-    start = np.tile(np.eye(3), (12, 3, 1, 1))
-    fitted = fit_articulated(moments, tree, moving.joints, start, 20)
-    np.testing.assert_allclose(fitted.rotations, moving.rotations, atol=1e-6)
-    np.testing.assert_allclose(fitted.translations, moving.translations, atol=1e-6)
-    for j, (parent, child) in enumerate(tree.joint_bodies):
-        for body in (parent, child):
-            carried = fitted.rotations[:, body] @ moving.joints[j] + fitted.translations[:, body]
-            np.testing.assert_allclose(carried, fitted.joint_positions[:, j], atol=1e-9)
-
-
 def test_points_of_any_frame_get_the_bodies_of_the_samples(three, found):
     paths = MotionPaths(three.positions)
     rng = np.random.default_rng(5)
@@ -323,7 +277,7 @@ def test_wrong_paths_are_refused(three):
         find_motion_bodies(MotionPaths(three.positions[:5]))
 
 
-def test_common_point_of_two_motions_and_its_kind():
+def test_common_point_of_two_motions_and_its_axis():
     rng = np.random.default_rng(8)
     point = np.array([0.3, -0.2, 0.5])
     first = Rotation.from_rotvec(rng.normal(scale=0.3, size=(40, 3)))
@@ -336,8 +290,7 @@ def test_common_point_of_two_motions_and_its_kind():
         start = rng.normal(scale=0.2, size=(40, 3))
         translations = start, start + rotations[0] @ point - rotations[1] @ point
         near = point + (np.array([0.0, 0.06, 0.08]) if hinge else np.array([0.1, 0.0, 0.0]))
-        joint = common_point(rotations, translations, np.ones(40), near, 1e-6, 1.0, 1e-4, 0.1)
-        assert joint.hinge == hinge
+        joint = common_point(rotations, translations, np.ones(40), near, 1e-6, 1.0, 1e-4)
         if hinge:  # along the axis the prior decides
             np.testing.assert_allclose(joint.point, near, atol=1e-4)
             np.testing.assert_allclose(np.abs(joint.axis), [0.0, 0.6, 0.8], atol=1e-3)
@@ -355,7 +308,7 @@ def test_joint_of_motions_that_do_not_tell_stays_at_the_interface():
     translations = np.zeros((40, 3)), near - rotations[1] @ near + apart
 
     def away(spread: float) -> float:
-        joint = common_point(rotations, translations, np.ones(40), near, 0.0, spread, 1e-4, 0.1)
+        joint = common_point(rotations, translations, np.ones(40), near, 0.0, spread, 1e-4)
         return float(np.linalg.norm(joint.point - near))
 
     assert away(1e3) > 0.5 and away(0.05) < 0.05
