@@ -54,19 +54,26 @@ def threads(workers: int | None = None) -> Iterator[ThreadPoolExecutor]:
 def map_items(
     function: Callable[[Item], Result],
     items: Sequence[Item],
-    executor: Executor,
+    executor: Executor | None,
     stage: str = "",
     progress: Progress = silent,
     ahead: int = 16,
 ) -> Iterator[Result]:
     """Yield `function(item)` in the order of the items, at most `ahead` of them under way at once.
 
-    The first error cancels what has not begun and is raised.
+    The first error cancels what has not begun and is raised. Without an executor the items are done one by one.
     """
     pending: deque[Future[Result]] = deque()
     todo = iter(items)
     done = 0
     progress(stage, 0, len(items))
+    if executor is None:
+        for item in todo:
+            result = function(item)
+            done += 1
+            progress(stage, done, len(items))
+            yield result
+        return
     try:
         for item in todo:
             pending.append(executor.submit(function, item))

@@ -6,7 +6,7 @@ the sums well conditioned and makes every threshold independent of the subject's
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numba import njit
@@ -55,13 +55,16 @@ class Ellipsoids:
     @classmethod
     def stack(cls, frames: list[Ellipsoids]) -> Ellipsoids:
         """Join the ellipsoids of T frames, all of the same number K, into arrays (T, K, …)."""
-        return cls(
-            np.stack([f.centers for f in frames]),
-            np.stack([f.radii for f in frames]),
-            np.stack([f.rotations for f in frames]),
-            np.stack([f.counts for f in frames]),
-            np.stack([f.errors for f in frames]),
-        )
+        return cls(*(np.stack([getattr(f, name.name) for f in frames]) for name in fields(cls)))
+
+    @classmethod
+    def joined(cls, parts: list[Ellipsoids]) -> Ellipsoids:
+        """Put the ellipsoids of several parts beside each other, (T, ΣK, …)."""
+        return cls(*(np.concatenate([getattr(p, name.name) for p in parts], axis=1) for name in fields(cls)))
+
+    def select(self, chosen: np.ndarray) -> Ellipsoids:
+        """Some ellipsoids of a sequence, (T, K', …)."""
+        return Ellipsoids(*(getattr(self, name.name)[:, chosen] for name in fields(self)))
 
 
 def check_points(points: np.ndarray, frame: int, least: int) -> np.ndarray:
@@ -190,15 +193,12 @@ def equivalent_length(mean: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def add_moments(points: np.ndarray, labels: np.ndarray, moments: np.ndarray) -> None:
-    """Add the moments of labelled points to `moments` (K, 10); negative labels are left out."""
-    for i in range(points.shape[0]):
-        k = labels[i]
-        if k < 0:
-            continue
+def range_moments(points: np.ndarray, start: int, end: int, m: np.ndarray) -> None:
+    """Write the moments of points[start:end] to `m` (10,)."""
+    m[:] = 0.0
+    m[0] = end - start
+    for i in range(start, end):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        m = moments[k]
-        m[0] += 1.0
         m[1] += x
         m[2] += y
         m[3] += z
@@ -219,28 +219,10 @@ def all_axes(moments: np.ndarray, variances: np.ndarray, axes: np.ndarray) -> No
 
 
 @njit(cache=True, nogil=True)
-def labelled_errors(points: np.ndarray, labels: np.ndarray, moments: np.ndarray) -> np.ndarray:
-    """Equivalent error length of every labelled set, grid units."""
-    count = moments.shape[0]
-    variances = np.ones((count, 3))
-    axes = np.zeros((count, 3, 3))
-    all_axes(moments, variances, axes)
-    errors = np.zeros(count)
-    for i in range(points.shape[0]):
-        k = labels[i]
-        if k >= 0:
-            errors[k] += error_terms(points, i, i + 1, moments[k], variances[k], axes[k])
-    for k in range(count):
-        if moments[k, 0] > 0.0:
-            errors[k] = equivalent_length(errors[k] / moments[k, 0])
-    return errors
-
-
-@njit(cache=True, nogil=True)
 def union_errors(
     points: np.ndarray, begin: np.ndarray, end: np.ndarray, union: np.ndarray, moments: np.ndarray
 ) -> np.ndarray:
-    """Equivalent error lengths of unions of ranges of points, as `labelled_errors` but faster.
+    """Equivalent error lengths of unions of ranges of points, grid units; 0 of those without points.
 
     Range k is points[begin[k]:end[k]] and part of union[k]; `moments` are those of the unions.
     """
@@ -253,7 +235,8 @@ def union_errors(
         u = union[k]
         errors[u] += error_terms(points, begin[k], end[k], moments[u], variances[u], axes[u])
     for u in range(count):
-        errors[u] = equivalent_length(errors[u] / moments[u, 0])
+        if moments[u, 0] > 0.0:
+            errors[u] = equivalent_length(errors[u] / moments[u, 0])
     return errors
 
 
@@ -309,7 +292,11 @@ def fit_ellipsoids(points: np.ndarray, labels: np.ndarray, count: int, spacing: 
     points = check_points(points, 0, 1)
     origin = points.mean(axis=0)
     grid = (points - origin) / spacing
-    labels = np.ascontiguousarray(labels, dtype=np.int32)
+    # set by set
+    order = np.argsort(labels, kind="stable")
+    grid, ends = grid[order], np.searchsorted(labels[order], np.arange(count + 1))
     moments = np.zeros((count, 10))
-    add_moments(grid, labels, moments)
-    return from_moments(moments, labelled_errors(grid, labels, moments), origin, spacing)
+    for k in range(count):
+        range_moments(grid, ends[k], ends[k + 1], moments[k])
+    errors = union_errors(grid, ends[:-1], ends[1:], np.arange(count), moments)
+    return from_moments(moments, errors, origin, spacing)

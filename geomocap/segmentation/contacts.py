@@ -94,3 +94,34 @@ def count_contacts(points: np.ndarray, labels: np.ndarray, count: int) -> np.nda
                     contacts[b, a] += 1
                 j = after[j]
     return contacts
+
+
+def contacts_of_bodies(
+    contacts: np.ndarray, touching: np.ndarray, body: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Contacts of bodies from those of their ellipsoids.
+
+    Parameters
+    ----------
+    contacts, touching : (K, K) float
+        Neighbouring pairs of points between two ellipsoids, and the fraction of the frames in which they touch.
+    body : (K,) int
+        Body of each ellipsoid; negative: none.
+    count : int
+        Number of bodies B.
+
+    Returns
+    -------
+    contacts : (B, B) float
+        Sums; zero on the diagonal.
+    touching : (B, B) float
+        Those of the pair of ellipsoids that touches most.
+    """
+    member = (body[None] == np.arange(count)[:, None]).astype(float)
+    between = member @ contacts @ member.T
+    np.fill_diagonal(between, 0.0)
+    most = np.zeros((count, count))
+    for a in range(count):
+        for b in range(a):
+            most[a, b] = most[b, a] = touching[np.ix_(body == a, body == b)].max(initial=0.0)
+    return between, most

@@ -8,17 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.distance import cdist
 
 from geomocap.errors import GeometryError
 from geomocap.model.ellipsoids import Ellipsoids, from_moments, union_errors
 from geomocap.segmentation.contacts import count_contacts
+from geomocap.segmentation.ellipsoid_assignment import assign, match_cost
 from geomocap.segmentation.ellipsoid_merging import merge_frame
 from geomocap.segmentation.ellipsoid_splitting import SplitFrame, split_points
 from geomocap.segmentation.m3_settings import SegmentationSettings
 
-_CANDIDATES = 16
 _CONTACTS_EVERY = 4
 
 
@@ -45,101 +44,6 @@ class EllipsoidPaths:
     contacts: np.ndarray
     touching: np.ndarray
     repaired: np.ndarray
-
-
-@njit(cache=True, nogil=True)
-def assign_tree(
-    cost: np.ndarray,
-    candidates: np.ndarray,
-    order: np.ndarray,
-    parent: np.ndarray,
-    old: np.ndarray,
-    new: np.ndarray,
-    coherence: float,
-) -> np.ndarray:
-    """Assign a target to every ellipsoid by dynamic programming on a tree; several may get the same.
-
-    Minimises Σ cost[i, target_i] + coherence · Σ_(edges i, p) ‖(new_target_i − old_i) − (new_target_p − old_p)‖.
-
-    Parameters
-    ----------
-    cost : (K, C) float
-        Cost of the candidates of each ellipsoid.
-    candidates : (K, C) int
-        Targets to choose from.
-    order : (K,) int
-        Parents before children; the stages run through it backwards.
-    parent : (K,) int
-        Parent in the tree; of the first in the order it is not used.
-    old : (K, 3) float
-    new : (L, 3) float
-    coherence : float
-
-    Returns
-    -------
-    (K,) int64
-    """
-    count, choices = cost.shape
-    value = cost.copy()
-    choice = np.empty((count, choices), np.int64)
-    for step in range(count - 1, 0, -1):
-        i = order[step]
-        p = parent[i]
-        for a in range(choices):
-            tp = candidates[p, a]
-            best, arg = np.inf, 0
-            for b in range(choices):
-                v = value[i, b]
-                if v >= best:
-                    continue
-                if coherence > 0.0:
-                    ti = candidates[i, b]
-                    dx = (new[ti, 0] - old[i, 0]) - (new[tp, 0] - old[p, 0])
-                    dy = (new[ti, 1] - old[i, 1]) - (new[tp, 1] - old[p, 1])
-                    dz = (new[ti, 2] - old[i, 2]) - (new[tp, 2] - old[p, 2])
-                    v += coherence * np.sqrt(dx * dx + dy * dy + dz * dz)
-                if v < best:
-                    best, arg = v, b
-            value[p, a] += best
-            choice[i, a] = arg
-    picked = np.empty(count, np.int64)
-    target = np.empty(count, np.int64)
-    for step in range(count):
-        i = order[step]
-        picked[i] = np.argmin(value[i]) if step == 0 else choice[i, picked[parent[i]]]
-        target[i] = candidates[i, picked[i]]
-    return target
-
-
-def _stages(centers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Order of the stages: the minimum spanning tree over the centres, breadth first from the most central one."""
-    distance = cdist(centers, centers)
-    root = int(np.argmin(distance.sum(axis=1)))
-    tree = minimum_spanning_tree(distance + 1e-12)
-    order, parent = breadth_first_order(tree, root, directed=False)
-    return order.astype(np.int64), np.where(parent < 0, root, parent).astype(np.int64)
-
-
-def match_cost(
-    old: np.ndarray, old_counts: np.ndarray, new: np.ndarray, new_counts: np.ndarray, size_weight: float
-) -> np.ndarray:
-    """Cost of every pair of ellipsoids: distance of the centres plus weighted difference of the sizes (section 6).
-
-    The difference of the counts is divided by the square root of the mean count: both terms are lengths then, in
-    spacings, and their balance does not change with the resolution.
-
-    Parameters
-    ----------
-    old, new : (K, 3), (L, 3) float, spacings
-    old_counts, new_counts : (K,), (L,) float
-    size_weight : float
-
-    Returns
-    -------
-    (K, L) float, spacings
-    """
-    difference = np.abs(old_counts[:, None] - new_counts[None])
-    return cdist(old, new) + size_weight / np.sqrt(old_counts.mean()) * difference
 
 
 @njit(cache=True, nogil=True)
@@ -294,15 +198,12 @@ def match_frame(
     """
     count = len(before.moments)
     old, old_counts = before.centers - split.origin / split.spacing, before.moments[:, 0]
-    order, parent = _stages(old) if settings.coherence_weight > 0 else (np.arange(count), np.zeros(count, np.int64))
     sets = _Sets(split, 4 * count)
     repaired = 0
     while True:
         new = sets.centers
         cost = match_cost(old, old_counts, new, sets.counts, settings.size_weight)
-        candidates = _cheapest(cost, 1 if settings.coherence_weight == 0 else _CANDIDATES)
-        chosen = np.take_along_axis(cost, candidates, axis=1)
-        target = assign_tree(chosen, candidates, order, parent, old, new, settings.coherence_weight)
+        target = assign(cost, old, new, settings.coherence_weight)
         # Duplicated ellipsoids: split them and assign again
         duplicated = np.flatnonzero(np.bincount(target) > 1)
         cut = sets.halve(duplicated)
@@ -324,13 +225,6 @@ def match_frame(
     partner = cdist(new, new[target]).argmin(axis=1).astype(np.int32)
     partner[target] = np.arange(count)
     return MatchedFrame.of(split, sets, partner, count, repaired, touch)
-
-
-def _cheapest(cost: np.ndarray, number: int) -> np.ndarray:
-    """Numbers of the cheapest targets of each ellipsoid, (K, C)."""
-    if number == 1:
-        return cost.argmin(axis=1)[:, None]
-    return np.argsort(cost, axis=1, kind="stable")[:, :number]
 
 
 def match_frames(splits: Iterable[SplitFrame], settings: SegmentationSettings) -> EllipsoidPaths:

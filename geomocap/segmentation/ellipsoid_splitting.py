@@ -14,6 +14,7 @@ from geomocap.model.ellipsoids import (
     equivalent_length,
     error_terms,
     from_moments,
+    range_moments,
 )
 from geomocap.segmentation.m3_settings import SegmentationSettings
 
@@ -56,23 +57,6 @@ class SplitFrame:
     def leaves(self) -> np.ndarray:
         """Leaf of each of `points`, (N,) int32."""
         return np.repeat(np.arange(len(self.errors), dtype=np.int32), np.diff(self.starts))
-
-
-@njit(cache=True, nogil=True)
-def _range_moments(points: np.ndarray, start: int, end: int, m: np.ndarray) -> None:
-    m[:] = 0.0
-    m[0] = end - start
-    for i in range(start, end):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        m[1] += x
-        m[2] += y
-        m[3] += z
-        m[4] += x * x
-        m[5] += x * y
-        m[6] += x * z
-        m[7] += y * y
-        m[8] += y * z
-        m[9] += z * z
 
 
 @njit(cache=True, nogil=True)
@@ -130,7 +114,7 @@ def split_points(
     depth = np.empty(max_depth + 2, np.int64)
     waiting = np.empty((max_depth + 2, 10))
     begin[0], end[0], depth[0] = 0, n, 0
-    _range_moments(pts, 0, n, waiting[0])
+    range_moments(pts, 0, n, waiting[0])
     top, leaves = 1, 0
     variances = np.empty(3)
     axes = np.empty((3, 3))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -15,16 +16,46 @@ from geomocap.segmentation.contacts import count_contacts
 from geomocap.segmentation.ellipsoid_matching import EllipsoidPaths
 from geomocap.segmentation.relative_paths import Grouping, group_paths, path_integrals
 
+Points = Callable[[int], np.ndarray]
+
 _ISOLATED = 0.5
 
 
-def _subset(points: Callable[[int], np.ndarray], members: list[np.ndarray], frame: int) -> np.ndarray:
-    return points(frame)[members[frame]]
+@dataclass(frozen=True)
+class _PointSet:
+    """A part of the points of all frames, divided into ellipsoids by itself.
+
+    `members` are the numbers of its points in each frame, T arrays (n_t,).
+    """
+
+    paths: EllipsoidPaths
+    members: list[np.ndarray]
+
+    def within(self, chosen: np.ndarray) -> list[np.ndarray]:
+        """Numbers of the points of some of its ellipsoids in each frame."""
+        inside = np.zeros(len(self.paths.contacts), bool)
+        inside[chosen] = True
+        return [these[inside[label]] for these, label in zip(self.members, self.paths.labels, strict=True)]
+
+    def isolated(self, chosen: np.ndarray) -> Iterator[np.ndarray]:
+        """Ellipsoids among the chosen that touch, directly or through others, in at least half of the frames."""
+        graph = self.paths.touching[np.ix_(chosen, chosen)] >= _ISOLATED
+        count, component = connected_components(graph, directed=False)
+        return (chosen[component == c] for c in range(count))
+
+
+@dataclass(frozen=True)
+class _FoundBody:
+    """Ellipsoids of a set that are one body, and the one among them that it was found from."""
+
+    origin: _PointSet
+    chosen: np.ndarray
+    seed: int
 
 
 def peel_bodies(
-    run: Callable[[Callable[[int], np.ndarray]], EllipsoidPaths],
-    points: Callable[[int], np.ndarray],
+    run: Callable[[Points], EllipsoidPaths],
+    points: Points,
     paths: EllipsoidPaths,
     threshold: float,
     min_points: int,
@@ -56,89 +87,62 @@ def peel_bodies(
     Grouping
         Bodies in the order in which they were found.
     """
-    frames = len(paths.labels)
-    everything = [np.arange(len(labels), dtype=np.int32) for labels in paths.labels]
-    queue: deque[tuple[EllipsoidPaths, list[np.ndarray]]] = deque([(paths, everything)])
-    parts: list[tuple[Ellipsoids, int]] = []
-    labels = [np.full(len(these), -1, np.int16) for these in paths.labels]
-    seeds: list[int] = []
-    total = 0
-
-    def keep(found: EllipsoidPaths, members: list[np.ndarray], chosen: np.ndarray, seed: int) -> None:
-        nonlocal total
-        number = np.full(found.ellipsoids.counts.shape[1], -1, np.int16)
-        number[chosen] = total + np.arange(len(chosen))
-        for t in range(frames):
-            new = number[found.labels[t]]
-            labels[t][members[t][new >= 0]] = new[new >= 0]
-        seeds.append(int(number[seed]))
-        parts.append((_choose(found.ellipsoids, chosen), len(chosen)))
-        total += len(chosen)
-
+    found: list[_FoundBody] = []
+    queue = deque([_PointSet(paths, [np.arange(len(labels), dtype=np.int32) for labels in paths.labels])])
     while queue:
-        found, members = queue.popleft()
-        first = found.ellipsoids
-        integrals = path_integrals(first.centers)
-        grouping = group_paths(integrals, first.centers[0], first.counts[0], threshold)
-        sizes = np.bincount(grouping.body, first.counts.mean(axis=0))
-        largest = int(np.argmax(sizes))
-        keep(found, members, np.flatnonzero(grouping.body == largest), grouping.seeds[largest])
-        rest = np.flatnonzero(grouping.body != largest)
-        if len(rest) == 0:
-            continue
-        graph = found.touching[np.ix_(rest, rest)] >= _ISOLATED
-        count, component = connected_components(graph, directed=False)
-        for c in range(count):
-            chosen = rest[component == c]
-            inside = np.zeros(first.counts.shape[1], bool)
-            inside[chosen] = True
-            these = [members[t][inside[found.labels[t]]] for t in range(frames)]
-            again = None
-            if min(len(m) for m in these) >= 4 * min_points and len(np.unique(grouping.body[chosen])) > 1:
-                try:
-                    again = run(partial(_subset, points, these))
-                except GeometryError:  # too few points in some frame for the ellipsoids of the first
-                    again = None
+        some = queue.popleft()
+        first = some.paths.ellipsoids
+        grouping = group_paths(path_integrals(first.centers), first.centers[0], first.counts[0], threshold)
+        # Take the largest body out
+        largest = int(np.argmax(np.bincount(grouping.body, first.counts.mean(axis=0))))
+        found.append(_FoundBody(some, np.flatnonzero(grouping.body == largest), int(grouping.seeds[largest])))
+        # Repeat on each isolated set of the rest
+        for chosen in some.isolated(np.flatnonzero(grouping.body != largest)):
+            members = some.within(chosen)
+            enough = min(map(len, members)) >= 4 * min_points
+            one = len(np.unique(grouping.body[chosen])) == 1
+            again = _segmented_again(run, points, members) if enough and not one else None
             if again is not None:
-                queue.append((again, these))
+                queue.append(again)
             else:
-                keep(found, members, chosen, int(chosen[np.argmax(first.counts[0, chosen])]))
-    ellipsoids = _join([part for part, _ in parts])
-    body = np.repeat(np.arange(len(parts), dtype=np.int32), [n for _, n in parts])
-    contacts, touching = _contacts(points, labels, total, spacing)
-    joined = EllipsoidPaths(ellipsoids, tuple(labels), contacts, touching, paths.repaired)
-    integrals = path_integrals(ellipsoids.centers)
-    return joined, Grouping(body, np.array(seeds, np.int32), integrals, threshold)
+                found.append(_FoundBody(some, chosen, int(chosen[np.argmax(first.counts[0, chosen])])))
+    return _joined(found, points, paths, threshold, spacing)
 
 
-def _choose(ellipsoids: Ellipsoids, chosen: np.ndarray) -> Ellipsoids:
-    return Ellipsoids(
-        ellipsoids.centers[:, chosen],
-        ellipsoids.radii[:, chosen],
-        ellipsoids.rotations[:, chosen],
-        ellipsoids.counts[:, chosen],
-        ellipsoids.errors[:, chosen],
-    )
+def _segmented_again(
+    run: Callable[[Points], EllipsoidPaths], points: Points, members: list[np.ndarray]
+) -> _PointSet | None:
+    try:
+        return _PointSet(run(partial(_subset, points, members)), members)
+    except GeometryError:  # too few points in some frame for the ellipsoids of the first
+        return None
 
 
-def _join(parts: list[Ellipsoids]) -> Ellipsoids:
-    return Ellipsoids(
-        np.concatenate([p.centers for p in parts], axis=1),
-        np.concatenate([p.radii for p in parts], axis=1),
-        np.concatenate([p.rotations for p in parts], axis=1),
-        np.concatenate([p.counts for p in parts], axis=1),
-        np.concatenate([p.errors for p in parts], axis=1),
-    )
+def _subset(points: Points, members: list[np.ndarray], frame: int) -> np.ndarray:
+    return points(frame)[members[frame]]
 
 
-def _contacts(
-    points: Callable[[int], np.ndarray], labels: list[np.ndarray], count: int, spacing: float
-) -> tuple[np.ndarray, np.ndarray]:
-    contacts = np.zeros((count, count))
-    touching = np.zeros((count, count))
+def _joined(
+    found: list[_FoundBody], points: Points, whole: EllipsoidPaths, threshold: float, spacing: float
+) -> tuple[EllipsoidPaths, Grouping]:
+    """All bodies' ellipsoids as paths of the whole, numbered body by body."""
+    labels = [np.full(len(these), -1, np.int16) for these in whole.labels]
+    seeds = np.empty(len(found), np.int32)
+    total = 0
+    for b, one in enumerate(found):
+        for k in one.chosen:
+            for label, members in zip(labels, one.origin.within(np.array([k])), strict=True):
+                label[members] = total
+            if k == one.seed:
+                seeds[b] = total
+            total += 1
+    ellipsoids = Ellipsoids.joined([b.origin.paths.ellipsoids.select(b.chosen) for b in found])
+    contacts, touching = np.zeros((total, total)), np.zeros((total, total))
     for frame, these in enumerate(labels):
         grid = np.ascontiguousarray(points(frame), np.float64) / spacing
-        found = count_contacts(grid, these.astype(np.int32), count)
-        contacts += found
-        touching += found > 0
-    return contacts / len(labels), touching / len(labels)
+        between = count_contacts(grid, these.astype(np.int32), total)
+        contacts += between / len(labels)
+        touching += (between > 0) / len(labels)
+    body = np.repeat(np.arange(len(found), dtype=np.int32), [len(b.chosen) for b in found])
+    joined = EllipsoidPaths(ellipsoids, tuple(labels), contacts, touching, whole.repaired)
+    return joined, Grouping(body, seeds, path_integrals(ellipsoids.centers), threshold)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from functools import partial
 
@@ -12,6 +12,7 @@ from geomocap.errors import GeometryError
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items
 from geomocap.segmentation.body_turns import body_rotations
+from geomocap.segmentation.contacts import contacts_of_bodies
 from geomocap.segmentation.ellipsoid_matching import EllipsoidPaths, match_frames
 from geomocap.segmentation.ellipsoid_splitting import SplitFrame, split_frame
 from geomocap.segmentation.iterations import peel_bodies
@@ -62,30 +63,41 @@ def segment_m3(
         is named.
     """
     settings = settings or SegmentationSettings()
-    if not callable(points):
-        frames = len(points) if frames is None else frames
-        points = points.__getitem__
-    if not frames or frames < 1:
-        raise GeometryError("no frames to segment; the capture or the folder of scans is empty")
-    if not (np.isfinite(spacing) and spacing > 0):
-        raise GeometryError(f"point spacing {spacing}: expected a positive length in metres")
+    points, frames = _checked(points, frames, spacing)
 
-    def run(some: Points, some_progress: Progress = silent) -> EllipsoidPaths:
+    def follow(some: Points, some_progress: Progress = silent) -> EllipsoidPaths:
         return ellipsoid_paths(some, frames, spacing, settings, executor, some_progress)
 
-    # Steps 1 and 2: ellipsoids of every frame, matched from frame to frame
-    paths = run(points, progress)
-    # Step 3: rigid bodies from relative paths
+    # Ellipsoids of every frame, and their paths (sections 5 and 6)
+    paths = follow(points, progress)
+    # Rigid bodies by relative paths (section 7)
     integrals = path_integrals(paths.ellipsoids.centers)
     threshold = max(similarity_threshold(integrals, settings.body_deviations), _STILL * spacing)
     if frames == 1:
-        grouping = Grouping(np.full(len(integrals), -1, np.int32), np.empty(0, np.int32), integrals, threshold)
+        grouping = Grouping.without_motion(integrals, threshold)
     elif settings.iterative:
-        paths, grouping = peel_bodies(run, points, paths, threshold, settings.min_points, spacing)
+        # The largest body is taken out and the rest done again (section 9)
+        paths, grouping = peel_bodies(follow, points, paths, threshold, settings.min_points, spacing)
     else:
-        first = paths.ellipsoids
-        grouping = group_paths(integrals, first.centers[0], first.counts[0], threshold)
-    return _result(paths, grouping, spacing)
+        grouping = group_paths(integrals, paths.ellipsoids.centers[0], paths.ellipsoids.counts[0], threshold)
+    # One ellipsoid for each body and frame (section 7, end), and its turns
+    body, count = grouping.body, len(grouping.seeds)
+    bodies = unite(paths.ellipsoids, body, count)
+    contacts, touching = contacts_of_bodies(paths.contacts, paths.touching, body, count)
+    return Segmentation(
+        paths.ellipsoids,
+        body,
+        paths.labels,
+        bodies,
+        body_rotations(paths.ellipsoids, body, bodies),
+        contacts,
+        touching,
+        grouping.seeds,
+        grouping.integrals,
+        grouping.threshold,
+        paths.repaired,
+        spacing,
+    )
 
 
 def ellipsoid_paths(
@@ -100,58 +112,24 @@ def ellipsoid_paths(
 
     Parameters and errors as of `segment_m3`.
     """
-    return match_frames(_splits(points, frames, spacing, settings, executor, progress), settings)
+    split = partial(_split, points, spacing, settings)
+    # Split every frame (section 5.2.1)
+    splits = map_items(split, range(frames), executor, "segment", progress)
+    # Merge those of the first (section 5.2.2), and match them from frame to frame (section 6)
+    return match_frames(splits, settings)
+
+
+def _checked(points: Points | Sequence[np.ndarray], frames: int | None, spacing: float) -> tuple[Points, int]:
+    """What gives the points of a frame, and the number of frames."""
+    if not callable(points):
+        frames = len(points) if frames is None else frames
+        points = points.__getitem__
+    if not frames or frames < 1:
+        raise GeometryError("no frames to segment; the capture or the folder of scans is empty")
+    if not (np.isfinite(spacing) and spacing > 0):
+        raise GeometryError(f"point spacing {spacing}: expected a positive length in metres")
+    return points, frames
 
 
 def _split(points: Points, spacing: float, settings: SegmentationSettings, frame: int) -> SplitFrame:
     return split_frame(points(frame), spacing, settings, frame)
-
-
-def _splits(
-    points: Points,
-    frames: int,
-    spacing: float,
-    settings: SegmentationSettings,
-    executor: Executor | None,
-    progress: Progress,
-) -> Iterator[SplitFrame]:
-    work = partial(_split, points, spacing, settings)
-    if executor is not None:
-        yield from map_items(work, range(frames), executor, "segment", progress)
-        return
-    progress("segment", 0, frames)
-    for frame in range(frames):
-        yield work(frame)
-        progress("segment", frame + 1, frames)
-
-
-def _result(paths: EllipsoidPaths, grouping: Grouping, spacing: float) -> Segmentation:
-    body = grouping.body
-    count = len(grouping.seeds)
-    bodies = unite(paths.ellipsoids, body, count)
-    member = (body[None] == np.arange(count)[:, None]).astype(float)
-    contacts = member @ paths.contacts @ member.T
-    np.fill_diagonal(contacts, 0.0)
-    return Segmentation(
-        paths.ellipsoids,
-        body,
-        paths.labels,
-        bodies,
-        body_rotations(paths.ellipsoids, body, bodies),
-        contacts,
-        _touching(paths.touching, body, count),
-        grouping.seeds,
-        grouping.integrals,
-        grouping.threshold,
-        paths.repaired,
-        spacing,
-    )
-
-
-def _touching(touching: np.ndarray, body: np.ndarray, count: int) -> np.ndarray:
-    """Fraction of the frames in which two bodies touch: that of their pair of ellipsoids that touches most."""
-    result = np.zeros((count, count))
-    for a in range(count):
-        for b in range(a):
-            result[a, b] = result[b, a] = touching[np.ix_(body == a, body == b)].max(initial=0.0)
-    return result

@@ -30,6 +30,11 @@ class Grouping:
     integrals: np.ndarray
     threshold: float
 
+    @classmethod
+    def without_motion(cls, integrals: np.ndarray, threshold: float) -> Grouping:
+        """No bodies: a single frame has no motion to tell them by."""
+        return cls(np.full(len(integrals), -1, np.int32), np.empty(0, np.int32), integrals, threshold)
+
 
 def path_integrals(paths: np.ndarray) -> np.ndarray:
     """Integrals of the distance curves between relative paths (section 7, steps 1 to 3).

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from geomocap.errors import GeometryError
-from geomocap.model.hierarchy import Hierarchy, connect_bodies
+from geomocap.model.hierarchy import Hierarchy
 from geomocap.segmentation.axis_joints import grow_joints
+from geomocap.segmentation.body_connections import connect_bodies
 from geomocap.segmentation.m3_result import Segmentation
 from geomocap.segmentation.skeleton_settings import SkeletonSettings
 from geomocap.skeleton.bone_motion import fit_motion, forward_kinematics, local_rotations

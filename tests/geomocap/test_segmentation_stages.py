@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
 from geomocap.model.ellipsoids import fit_ellipsoids
-from geomocap.segmentation.ellipsoid_matching import assign_tree, first_frame, match_frame, match_frames
+from geomocap.segmentation.ellipsoid_assignment import assign_tree
+from geomocap.segmentation.ellipsoid_matching import first_frame, match_frame, match_frames
 from geomocap.segmentation.ellipsoid_merging import merge_frame
 from geomocap.segmentation.ellipsoid_splitting import SplitFrame, split_frame
 from geomocap.segmentation.m3_settings import SegmentationSettings

@@ -7,8 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
-from geomocap.model.hierarchy import Hierarchy, connect_bodies
+from geomocap.model.hierarchy import Hierarchy
 from geomocap.segmentation.axis_joints import grow_joints
+from geomocap.segmentation.body_connections import connect_bodies
 from geomocap.segmentation.m3 import segment_m3
 from geomocap.segmentation.m3_result import Segmentation
 from geomocap.segmentation.m3_settings import SegmentationSettings
