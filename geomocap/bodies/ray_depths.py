@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 
 from geomocap.bodies.motion_bodies import MotionBodies, MotionBodiesSettings, find_motion_bodies
 from geomocap.bodies.rigid_motions import fit_rigid_motion
-from geomocap.bodies.skin_blending import solve_symmetric
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.small_systems import solve_symmetric
 from geomocap.progress import Progress, silent
 
 _DEPTH_FRACTION = 0.05  # of what is missed along a ray, counts for a sample's place
@@ -36,7 +36,7 @@ _STAGE = "bodies"
 
 
 @dataclass(frozen=True)
-class _Places:
+class _RestPlaces:
     """Where samples lie at rest, if given motions carry them.
 
     Attributes
@@ -115,12 +115,12 @@ def settle_depths(paths: MotionPaths, bodies: MotionBodies) -> MotionPaths:
     return replace(paths, positions=_moved(paths, own))
 
 
-def _moved(paths: MotionPaths, places: _Places) -> np.ndarray:
+def _moved(paths: MotionPaths, places: _RestPlaces) -> np.ndarray:
     assert paths.ray is not None
     return paths.positions + places.depth[..., None] * paths.ray
 
 
-def _blended(paths: MotionPaths, weights: np.ndarray, rotations: np.ndarray, translations: np.ndarray) -> _Places:
+def _blended(paths: MotionPaths, weights: np.ndarray, rotations: np.ndarray, translations: np.ndarray) -> _RestPlaces:
     """Places of samples that follow their bodies with given weights (N, B)."""
     turns = np.einsum("nb,btij->ntij", weights, rotations)
     return _place(paths, turns, np.einsum("nb,bti->nti", weights, translations))
@@ -128,7 +128,7 @@ def _blended(paths: MotionPaths, weights: np.ndarray, rotations: np.ndarray, tra
 
 def _choose(
     paths: MotionPaths,
-    own: _Places,
+    own: _RestPlaces,
     label: np.ndarray,
     rest: np.ndarray,
     rotations: np.ndarray,
@@ -153,7 +153,7 @@ def _choose(
 
 def _refit(
     paths: MotionPaths,
-    places: _Places,
+    places: _RestPlaces,
     label: np.ndarray,
     weights: np.ndarray,
     rotations: np.ndarray,
@@ -179,7 +179,7 @@ def _refit(
     return np.searchsorted(kept, label), weights, rotations[kept], translations[kept]
 
 
-def _place(paths: MotionPaths, rotations: np.ndarray, translations: np.ndarray) -> _Places:
+def _place(paths: MotionPaths, rotations: np.ndarray, translations: np.ndarray) -> _RestPlaces:
     """Find where samples lie at rest, if motions (N or 1, T, 3, 3), (N or 1, T, 3) carry them."""
     assert paths.ray is not None
     found = place_samples(
@@ -191,7 +191,7 @@ def _place(paths: MotionPaths, rotations: np.ndarray, translations: np.ndarray) 
         _DEPTH_FRACTION,
         _LARGEST * paths.diagonal,
     )
-    return _Places(*found)
+    return _RestPlaces(*found)
 
 
 @numba.njit(cache=True, nogil=True)

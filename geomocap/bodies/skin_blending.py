@@ -8,8 +8,7 @@ import numba
 import numpy as np
 
 from geomocap.model.motion_paths import DEPTH_FRACTION
-
-_BIG = 1e30
+from geomocap.model.small_systems import solve_symmetric
 
 
 @dataclass(frozen=True)
@@ -29,24 +28,6 @@ class Blends:
     costs: np.ndarray
     partner: np.ndarray
     fraction: np.ndarray
-
-
-@numba.njit(cache=True, nogil=True)
-def solve_symmetric(N, b, x):
-    """Solve N x = b for x (3,) by cofactors; N (3, 3) symmetric and positive definite, `x` may be `b`."""
-    xx, xy, xz = (
-        N[1, 1] * N[2, 2] - N[1, 2] * N[1, 2],
-        N[0, 2] * N[1, 2] - N[0, 1] * N[2, 2],
-        N[0, 1] * N[1, 2] - N[0, 2] * N[1, 1],
-    )
-    yy, yz, zz = (
-        N[0, 0] * N[2, 2] - N[0, 2] * N[0, 2],
-        N[0, 1] * N[0, 2] - N[0, 0] * N[1, 2],
-        N[0, 0] * N[1, 1] - N[0, 1] * N[0, 1],
-    )
-    determinant = N[0, 0] * xx + N[0, 1] * xy + N[0, 2] * xz
-    u, v, w = b[0] / determinant, b[1] / determinant, b[2] / determinant
-    x[0], x[1], x[2] = xx * u + xy * v + xz * w, xy * u + yy * v + yz * w, xz * u + yz * v + zz * w
 
 
 @numba.njit(cache=True, nogil=True)
@@ -101,7 +82,7 @@ def _explain_one(
     """Fill row i of the results of `_explain`."""
     frames = weights.shape[1]
     bodies = len(rotations)
-    sighted = ray.shape[1] > 0
+    with_rays = ray.shape[1] > 0
     total = 1e-12
     for t in range(frames):
         total += weights[i, t]
@@ -123,7 +104,7 @@ def _explain_one(
                 for d in range(3):
                     carried += rotations[b, t, c, d] * place[d]
                 miss[b, t, c] = positions[i, t, c] - carried
-            if sighted:
+            if with_rays:
                 along = 0.0
                 for c in range(3):
                     along += miss[b, t, c] * ray[i, t, c]

@@ -13,11 +13,12 @@ from itertools import permutations
 import numpy as np
 
 from geomocap.calibration.network import Network
-from geomocap.calibration.orientation import ideal_coordinates, triangulate
+from geomocap.calibration.orientation import ideal_coordinates
 from geomocap.calibration.projection import interior_of
 from geomocap.errors import CalibrationError
 from geomocap.model.rig import Rig
 from geomocap.model.rotations import rigid_motion
+from geomocap.model.triangulation import nearest_to_rays
 
 AXES = {"x": 0, "y": 1, "z": 2}
 
@@ -233,16 +234,12 @@ def intersect(network: Network, pixels: np.ndarray) -> np.ndarray:
     """Forward intersection of points (C, N, 2) seen by the network's cameras: (N, 3) float, NaN if seen by one only."""
     ideal = ideal_coordinates(pixels, network.interior, network.sizes)
     last = {int(c): v for v, c in enumerate(network.view_camera)}
-    camera, point = np.nonzero(np.isfinite(ideal).all(axis=-1))
-    view = np.array([last[int(c)] for c in camera], dtype=np.int64)
-    rays = np.concatenate([ideal[camera, point], np.ones((len(point), 1))], axis=1)
-    directions = np.einsum("mji,mj->mi", network.rotation[view], rays)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = -np.einsum("mji,mj->mi", network.rotation[view], network.translation[view])
-    points = triangulate(origins, directions, point, pixels.shape[1])
-    count = np.bincount(point, minlength=pixels.shape[1])
-    points[count < 2] = np.nan
-    return points
+    view = np.array([last.get(c, 0) for c in range(len(pixels))])
+    rays = np.concatenate([ideal, np.ones((*ideal.shape[:2], 1))], axis=2)
+    directions = rays @ network.rotation[view]
+    directions /= np.linalg.norm(directions, axis=2, keepdims=True)
+    origins = -np.einsum("cji,cj->ci", network.rotation[view], network.translation[view])
+    return nearest_to_rays(origins[:, None], directions)
 
 
 def datum_from_l_shape(network: Network, candidates: np.ndarray, long_arm: float, short_arm: float, up: str) -> Datum:

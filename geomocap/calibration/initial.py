@@ -13,11 +13,12 @@ from geomocap.calibration.bundle_adjustment import AdjustedNetwork, adjust, imag
 from geomocap.calibration.calibration_settings import BarSettings
 from geomocap.calibration.lens_model import weak_prior
 from geomocap.calibration.network import Network
-from geomocap.calibration.orientation import chain, ideal_coordinates, relative_orientation, triangulate
+from geomocap.calibration.orientation import chain, ideal_coordinates, relative_orientation
 from geomocap.calibration.pairs import Pairing, pair_ends
 from geomocap.calibration.projection import N_INTERIOR
 from geomocap.calibration.target_observations import TargetObservations
 from geomocap.errors import CalibrationError
+from geomocap.model.triangulation import nearest_to_rays
 
 
 def two_candidates(observations: TargetObservations) -> np.ndarray:
@@ -111,13 +112,12 @@ def network_of(
     view = view_of[camera, bar]
     order = np.lexsort((end, view, bar))
     bar, camera, view, end = bar[order], camera[order], view[order], end[order]
-    rays = np.concatenate([ideal[camera, bar, end], np.ones((len(bar), 1))], axis=1)
     R, t = poses[:, :, :3], poses[:, :, 3]
-    directions = np.einsum("mji,mj->mi", R[view], rays)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = -np.einsum("cji,cj->ci", R, t)
+    directions = np.concatenate([ideal, np.ones((*ideal.shape[:3], 1))], axis=3) @ R[view_of]
+    directions /= np.linalg.norm(directions, axis=3, keepdims=True)
+    origins = -np.einsum("cji,cj->ci", R, t)[view_of]
     T = len(observations.frames)
-    points = triangulate(origins[view], directions, 2 * bar + end, 2 * T)
+    points = nearest_to_rays(np.repeat(origins, 2, axis=1), directions.reshape(len(pixels), 2 * T, 3))
     view_camera = np.zeros(len(poses), dtype=np.int64)
     view_camera[view_of] = np.arange(len(pixels))[:, None]
     network = Network(

@@ -1,4 +1,4 @@
-"""Forward intersection, relative orientation of two cameras, and the chain of them over all cameras."""
+"""Relative orientation of two cameras, and the chain of them over all cameras."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from geomocap.calibration.projection import camera_of
 from geomocap.errors import CalibrationError
+from geomocap.model.triangulation import nearest_to_rays
 
 
 @dataclass(frozen=True)
@@ -38,33 +39,6 @@ def ideal_coordinates(pixels: np.ndarray, interior: np.ndarray, sizes: np.ndarra
     return out
 
 
-def triangulate(origins: np.ndarray, directions: np.ndarray, point: np.ndarray, n_points: int) -> np.ndarray:
-    """Points nearest to their rays, least squares.
-
-    Parameters
-    ----------
-    origins, directions : (M, 3) float
-        Rays, directions of unit length.
-    point : (M,) int
-        The point that each ray belongs to.
-    n_points : int
-
-    Returns
-    -------
-    points : (n_points, 3) float
-        NaN with fewer than two rays, or parallel ones.
-    """
-    P = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    A = np.zeros((n_points, 3, 3))
-    b = np.zeros((n_points, 3))
-    np.add.at(A, point, P)
-    np.add.at(b, point, np.einsum("mij,mj->mi", P, origins))
-    good = np.linalg.det(A) > 1e-9
-    out = np.full((n_points, 3), np.nan)
-    out[good] = np.linalg.solve(A[good], b[good][:, :, None])[:, :, 0]
-    return out
-
-
 def relative_orientation(a: np.ndarray, b: np.ndarray, F: np.ndarray, length: float) -> Relative | None:
     """Relative orientation of two cameras from their essential matrix, scaled by the bars.
 
@@ -84,12 +58,10 @@ def relative_orientation(a: np.ndarray, b: np.ndarray, F: np.ndarray, length: fl
     rb = np.concatenate([b.reshape(-1, 2), np.ones((2 * len(b), 1))], axis=1)
     ra /= np.linalg.norm(ra, axis=1, keepdims=True)
     rb /= np.linalg.norm(rb, axis=1, keepdims=True)
-    index = np.arange(len(ra))
     best: tuple[int, np.ndarray, np.ndarray, np.ndarray] | None = None
     for R in (U @ W @ Vt, U @ W.T @ Vt):
         for t in (U[:, 2], -U[:, 2]):
-            origins = np.concatenate([np.zeros_like(ra), np.broadcast_to(-R.T @ t, rb.shape)])
-            X = triangulate(origins, np.concatenate([ra, rb @ R]), np.concatenate([index, index]), len(ra))
+            X = nearest_to_rays(np.stack([np.zeros(3), -R.T @ t])[:, None], np.stack([ra, rb @ R]))
             front = (X[:, 2] > 0) & ((X @ R.T + t)[:, 2] > 0)
             if best is None or front.sum() > best[0]:
                 best = (int(front.sum()), R, t, np.where(front[:, None], X, np.nan))

@@ -1,4 +1,4 @@
-"""6×6 solver and a-posteriori covariance of a matched position, compiled; `lsm` states the equations."""
+"""A-posteriori covariance of a matched position, compiled; `lsm` states the equations."""
 
 from __future__ import annotations
 
@@ -7,40 +7,9 @@ import math
 from numba import njit
 
 from geomocap.matching.spline import NOISE_SLOPE, NOISE_VALUE
+from geomocap.model.small_systems import cholesky, solve
 
 _TWO_PI = 2 * math.pi
-
-
-@njit(cache=True, nogil=True)
-def cholesky(H, L):
-    """Factorise a 6×6 matrix; False if it is not positive definite."""
-    for i in range(6):
-        for j in range(i + 1):
-            s = H[i, j]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            if i == j:
-                if not s > 1e-10 * H[i, i]:
-                    return False
-                L[i, i] = math.sqrt(s)
-            else:
-                L[i, j] = s / L[j, j]
-    return True
-
-
-@njit(cache=True, nogil=True)
-def solve(L, b, x):
-    """Solve L Lᵀ x = b."""
-    for i in range(6):
-        s = b[i]
-        for k in range(i):
-            s -= L[i, k] * x[k]
-        x[i] = s / L[i, i]
-    for i in range(5, -1, -1):
-        s = x[i]
-        for k in range(i + 1, 6):
-            s -= L[k, i] * x[k]
-        x[i] = s / L[i, i]
 
 
 @njit(cache=True, nogil=True)

@@ -12,8 +12,9 @@ import math
 import numpy as np
 from numba import njit
 
-from geomocap.matching.patch_covariance import cholesky, covariance, solve
+from geomocap.matching.patch_covariance import covariance
 from geomocap.matching.patch_sums import normal_equations, sample_and_project, sample_template, template_mask
+from geomocap.model.small_systems import cholesky, solve
 
 MATCHED = 0
 OUTSIDE_TEMPLATE = 1

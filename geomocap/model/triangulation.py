@@ -86,8 +86,10 @@ def triangulate(
     W *= focal[:, None, :, None] * focal[:, None, None, :] * use[:, :, None, None]
     number = use.sum(axis=0)
 
-    points = _nearest_to_rays(rig, x, use)
     R, t = rig.cam_from_world[:, :, :3], rig.cam_from_world[:, :, 3]
+    directions = np.concatenate([x, np.ones((views, count, 1))], axis=2) @ R
+    directions /= np.linalg.norm(directions, axis=2, keepdims=True)
+    points = np.nan_to_num(nearest_to_rays(rig.centers[:, None], directions, use))
     for _ in range(iterations):
         normal, right, _ = _normal_equations(R, t, x, W, points)
         step, _ = _solve(normal, right)
@@ -106,17 +108,25 @@ def triangulate(
     return Triangulation(points, inverse, rms, sigma0, number)
 
 
-def _nearest_to_rays(rig: Rig, x: np.ndarray, use: np.ndarray) -> np.ndarray:
-    """Point with the least sum of squared distances from its rays, (N, 3)."""
-    A = np.zeros((x.shape[1], 3, 3))
-    b = np.zeros((x.shape[1], 3))
-    for v, center in enumerate(rig.centers):
-        d = np.column_stack([x[v], np.ones(len(x[v]))]) @ rig.cam_from_world[v, :, :3]
-        d /= np.linalg.norm(d, axis=1, keepdims=True)
-        across = (np.eye(3) - d[:, :, None] * d[:, None, :]) * use[v, :, None, None]
-        A += across
-        b += across @ center
-    return _solve(A, b)[0]
+def nearest_to_rays(origins: np.ndarray, directions: np.ndarray, use: np.ndarray | None = None) -> np.ndarray:
+    """Points with the least sum of squared distances from their rays, (N, 3); NaN with fewer than two or parallel ones.
+
+    Parameters
+    ----------
+    origins, directions : (V, N, 3) float
+        V rays of each of N points, directions of unit length; origins may be (V, 1, 3).
+    use : (V, N) bool, optional
+        Which of them count; those that are finite if not given.
+    """
+    if use is None:
+        use = np.isfinite(directions).all(axis=2)
+    d = np.where(use[..., None], directions, 0.0)
+    across = (np.eye(3) - d[..., :, None] * d[..., None, :]) * use[..., None, None]
+    A = across.sum(axis=0)
+    b = (across @ np.broadcast_to(origins, d.shape)[..., None])[..., 0].sum(axis=0)
+    points, regular = _solve(A, b)
+    points[~regular] = np.nan
+    return points
 
 
 def _normal_equations(

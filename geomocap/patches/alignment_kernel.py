@@ -26,8 +26,9 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from geomocap.model.small_systems import cholesky, inverse_diagonal, solve
 from geomocap.patches.patch_samples import choose_samples, compare, sum_of_products
-from geomocap.patches.patch_templates import inverse_diagonal, local_camera, set_place, solve_normal, turn_by
+from geomocap.patches.patch_templates import local_camera, set_place, turn_by
 
 _FLOOR = 2.0  # noise of an image that even a perfect fit is granted, grey levels
 COHERENT = 0.15  # fraction of the samples over which residuals beyond that go together
@@ -183,9 +184,10 @@ def _align_some(
                         away += 0.5 * (q_n[k, j] * prior_Q[n, k, i] - q_n[k, i] * prior_Q[n, k, j])
                 N6[r, r] += 1 / (sd * sd)
                 r6[r] += away / (sd * sd)
-            solved = solve_normal(N6, r6, L6, x6)
+            solved = cholesky(N6, L6, 1e-12)
             if not solved:
                 break
+            solve(L6, r6, x6)
             if last or step == iterations:
                 break
             shift = math.sqrt(x6[0] ** 2 + x6[1] ** 2 + x6[2] ** 2)

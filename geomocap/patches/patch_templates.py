@@ -43,47 +43,6 @@ def set_place(X, Q, new_X, new_Q):
 
 
 @njit(cache=True, nogil=True)
-def solve_normal(N, b, L, x):
-    """Solve N x = b with N (6, 6) symmetric, lower triangle given; returns whether it is positive definite."""
-    for i in range(6):
-        for j in range(i + 1):
-            s = N[i, j]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            if i == j:
-                if s <= 1e-12 * N[i, i] or s <= 0:
-                    return False
-                L[i, i] = math.sqrt(s)
-            else:
-                L[i, j] = s / L[j, j]
-    for i in range(6):
-        s = b[i]
-        for k in range(i):
-            s -= L[i, k] * x[k]
-        x[i] = s / L[i, i]
-    for i in range(5, -1, -1):
-        s = x[i]
-        for k in range(i + 1, 6):
-            s -= L[k, i] * x[k]
-        x[i] = s / L[i, i]
-    return True
-
-
-@njit(cache=True, nogil=True)
-def inverse_diagonal(L, out):
-    """Diagonal of (L Lᵀ)⁻¹, with L (6, 6) lower triangular, into `out` (6,): the squares of L⁻¹ summed over rows."""
-    column = np.empty(6)
-    for r in range(6):
-        out[r] = 0.0
-        for i in range(r, 6):
-            s = 1.0 if i == r else 0.0
-            for k in range(r, i):
-                s -= L[i, k] * column[k]
-            column[i] = s / L[i, i]
-            out[r] += column[i] * column[i]
-
-
-@njit(cache=True, nogil=True)
 def turn_by(Q, w0, w1, w2, out):
     """Q · exp([w]×) into `out`."""
     angle = math.sqrt(w0 * w0 + w1 * w1 + w2 * w2)

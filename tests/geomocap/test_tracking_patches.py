@@ -5,11 +5,11 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from geomocap.model.small_systems import inverse_diagonal
 from geomocap.model.trajectories import REASONS
 from geomocap.patches.alignment_kernel import align_patches
 from geomocap.patches.patch_search import renewed
 from geomocap.patches.patch_settings import TrackingSettings
-from geomocap.patches.patch_templates import inverse_diagonal
 from geomocap.patches.patch_tracking import track_surface
 from geomocap.patches.seeding import (
     image_reduction,

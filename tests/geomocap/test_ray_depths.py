@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from geomocap.bodies import ray_depths as ray_depths
 from geomocap.bodies.motion_bodies import MotionBodies, MotionBodiesSettings, find_motion_bodies
 from geomocap.bodies.ray_depths import find_bodies_and_depths, place_samples, settle_depths
-from geomocap.bodies.skin_blending import solve_symmetric
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.small_systems import solve_symmetric
 from tests.geomocap.moving_chains import chain, same_partition, seen_by_single_cameras
 
 DEPTH_FRACTION = 0.05
@@ -19,8 +19,8 @@ DEPTH_FRACTION = 0.05
 def test_small_systems_are_solved_as_numpy_does():
     rng = np.random.default_rng(3)
     for _ in range(50):
-        sights = rng.normal(size=(4, 3))
-        N, b = sights.T @ sights + 0.01 * np.eye(3), rng.normal(size=3)
+        rays = rng.normal(size=(4, 3))
+        N, b = rays.T @ rays + 0.01 * np.eye(3), rng.normal(size=3)
         expected = np.linalg.solve(N, b)
         solve_symmetric(N, b, b)  # in place
         assert_allclose(b, expected, rtol=1e-9, atol=1e-9)
@@ -82,7 +82,7 @@ def test_depths_are_those_with_which_bodies_are_rigid(three, alone, bodies):
     assert np.quantile(after, 0.95) < 0.5 * np.quantile(before, 0.95)
 
 
-def test_positions_move_along_their_lines_of_sight_only(alone, bodies):
+def test_positions_move_along_their_rays_only(alone, bodies):
     settled = settle_depths(alone, bodies)
     moved = (settled.positions - alone.positions)[alone.seen]
     ray = alone.ray[alone.seen]
