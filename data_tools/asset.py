@@ -49,7 +49,7 @@ class AnimatedAsset:
         Vertices before skinning, asset's unit.
     faces : (F, 3) int
     normals_group : (V,) int
-        Vertices with the same number fraction one smooth normal (seams of the texture are not edges of the surface).
+        Vertices with the same number share one smooth normal (seams of the texture are not edges of the surface).
     uv : (V, 2) float
         Texture coordinates, (0, 0) the top-left corner of the texture.
     vertex_colors : (V, 3) float

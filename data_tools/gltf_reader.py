@@ -45,11 +45,6 @@ def load_gltf(path: Path, animation: str | int | None = None) -> AnimatedAsset:
         raise AssetError(f"{path}: not a valid glTF file ({error}); export it again") from None
 
 
-def animation_names(path: Path) -> tuple[str, ...]:
-    """Names of the animations in a glTF file; a nameless one is called by its number."""
-    return tuple(a.name or str(k) for k, a in enumerate(_open(Path(path)).animations))
-
-
 def _open(path: Path) -> pygltflib.GLTF2:
     if not path.is_file():
         raise AssetError(f"{path}: no such file; give a .glb or .gltf file")
@@ -106,7 +101,7 @@ def _channels(buffers: GltfBuffers, animation: pygltflib.Animation | None) -> tu
 
 
 @dataclass
-class _Mesh:
+class _Primitive:
     """One primitive on one node, with what moves it."""
 
     vertices: np.ndarray
@@ -236,7 +231,7 @@ class _Reader:
         self.slots.append((carrier, constant))
         return len(self.slots) - 1
 
-    def _meshes(self, node: int) -> list[_Mesh]:
+    def _meshes(self, node: int) -> list[_Primitive]:
         found = []
         description = self.gltf.nodes[node]
         mesh = self.gltf.meshes[description.mesh]
@@ -258,7 +253,7 @@ class _Reader:
                 colors = colors * np.clip(self.buffers.accessor(primitive.attributes.COLOR_0)[:, :3], 0, 1) ** (1 / 2.2)
             normals = primitive.attributes.NORMAL
             found.append(
-                _Mesh(
+                _Primitive(
                     vertices=vertices,
                     normals=np.zeros((len(vertices), 3)) if normals is None else self.buffers.accessor(normals),
                     faces=self._faces(primitive, len(vertices)),

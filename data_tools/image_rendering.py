@@ -6,19 +6,15 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import open3d as o3d
 from numba import njit
 
-from data_tools.camera_views import CameraView
+from data_tools.camera_views import PixelRays
 from data_tools.room import Light
 from data_tools.shading import ShadedSurface
+from geomocap.model.ray_casting import NOTHING, TriangleScene, touched_pixels
 from geomocap.model.rig import Rig
 
 SAMPLES, EDGE_SAMPLES = 2, 4  # rays a pixel are these squared: everywhere on the subject, and on its outline
-
-
-def _tensor(array: np.ndarray) -> o3d.core.Tensor:
-    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array))
 
 
 @dataclass(frozen=True)
@@ -29,19 +25,17 @@ class PosedSubject:
     ----------
     vertices : (V, 3) float, metres, world
     normals : (V, 3) float
-    scene : open3d RaycastingScene
+    scene : TriangleScene
     """
 
     vertices: np.ndarray
     normals: np.ndarray
-    scene: o3d.t.geometry.RaycastingScene
+    scene: TriangleScene
 
     @classmethod
     def of(cls, surface: ShadedSurface, vertices: np.ndarray) -> PosedSubject:
         """Build the ray casting scene (with one thread, so that the same rays always hit the same triangles)."""
-        scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        scene.add_triangles(_tensor(vertices.astype(np.float32)), _tensor(surface.faces.astype(np.uint32)))
-        return cls(vertices, surface.normals(vertices), scene)
+        return cls(vertices, surface.normals(vertices), TriangleScene(vertices, surface.faces, threads=1))
 
 
 @dataclass(frozen=True)
@@ -82,7 +76,7 @@ class FloorShadow:
         rays = np.zeros((len(k), ny, nx, 6), dtype=np.float32)
         rays[..., 0], rays[..., 1], rays[..., 2] = gx, gy, 1e-4
         rays[..., 3:] = toward[:, None, None]
-        blocked = subject.scene.test_occlusions(_tensor(rays)).numpy().mean(axis=0, dtype=np.float32)
+        blocked = subject.scene.occluded(rays).mean(axis=0, dtype=np.float32)
         return cls(low, cell, cv2.GaussianBlur(blocked, (0, 0), 1.0))
 
     def at(self, positions: np.ndarray) -> np.ndarray:
@@ -104,19 +98,19 @@ class Stage:
 
     Attributes
     ----------
-    view : CameraView
+    view : PixelRays
     background : (H, W, 3) float32, grey levels
     floor : (H, W, 2) float32
         Where the pixels' centres meet the floor, metres; NaN elsewhere.
     """
 
-    view: CameraView
+    view: PixelRays
     background: np.ndarray
     floor: np.ndarray
 
 
 def render_subject(
-    subject: PosedSubject, surface: ShadedSurface, rig: Rig, camera: int, view: CameraView, light: Light
+    subject: PosedSubject, surface: ShadedSurface, rig: Rig, camera: int, view: PixelRays, light: Light
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Render the subject alone.
 
@@ -130,9 +124,8 @@ def render_subject(
         Its mean colour there, grey levels.
     """
     width, height = view.size
-    pixels = candidate_pixels(
-        rig.select([rig.names[camera]]).project(subject.vertices)[0], surface.faces, width, height
-    )
+    corners = rig.select([rig.names[camera]]).project(subject.vertices)[0]
+    pixels = np.flatnonzero(touched_pixels(corners, surface.faces, width, height))
     coverage, colors = _cast(subject, surface, view, light, pixels, SAMPLES)
     # The outline again, with more rays
     touched = np.zeros(width * height, dtype=np.uint8)
@@ -147,16 +140,13 @@ def render_subject(
 
 
 def _cast(
-    subject: PosedSubject, surface: ShadedSurface, view: CameraView, light: Light, pixels: np.ndarray, samples: int
+    subject: PosedSubject, surface: ShadedSurface, view: PixelRays, light: Light, pixels: np.ndarray, samples: int
 ) -> tuple[np.ndarray, np.ndarray]:
     if not len(pixels):
         return np.zeros(0, np.float32), np.zeros((0, 3), np.float32)
-    rays = view.rays(pixels, samples).reshape(-1, 6)
-    hits = subject.scene.cast_rays(_tensor(rays))
-    triangle = hits["primitive_ids"].numpy()
-    hit = np.flatnonzero(triangle != o3d.t.geometry.RaycastingScene.INVALID_ID)
-    uvs = hits["primitive_uvs"].numpy()[hit]
-    shaded = surface.shade(subject.normals, triangle[hit].astype(np.int64), uvs, light.vector)
+    _, triangle, uv = subject.scene.cast(view.rays(pixels, samples).reshape(-1, 6))
+    hit = np.flatnonzero(triangle != NOTHING)
+    shaded = surface.shade(subject.normals, triangle[hit].astype(np.int64), uv[hit], light.vector)
     return _average(hit // samples**2, shaded, len(pixels), samples**2)
 
 
@@ -175,40 +165,6 @@ def _average(owner: np.ndarray, colors: np.ndarray, count: int, samples: int) ->
                 total[n, k] /= hits[n]
         hits[n] /= samples
     return hits, total
-
-
-def candidate_pixels(projected: np.ndarray, faces: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Row-major numbers of all pixels that the triangles may touch, in tiles of 4 × 4 pixels.
-
-    Parameters
-    ----------
-    projected : (V, 2) float
-        COLMAP pixels of the vertices, NaN behind the camera.
-    """
-    return np.flatnonzero(_mark(projected, faces, width, height).ravel())
-
-
-@njit(cache=True, nogil=True)
-def _mark(projected: np.ndarray, faces: np.ndarray, width: int, height: int) -> np.ndarray:
-    marked = np.zeros((height, width), dtype=np.bool_)
-    tiles = np.zeros((height // 4 + 1, width // 4 + 1), dtype=np.bool_)
-    for f in range(len(faces)):
-        u0, v0, u1, v1 = 1e30, 1e30, -1e30, -1e30
-        for k in range(3):
-            u, v = projected[faces[f, k], 0], projected[faces[f, k], 1]
-            if np.isnan(u) or np.isnan(v):
-                return np.ones((height, width), dtype=np.bool_)
-            u0, v0, u1, v1 = min(u0, u), min(v0, v), max(u1, u), max(v1, v)
-        # Distortion bends the edges of large triangles outwards
-        margin = 1.0 + 0.03 * max(u1 - u0, v1 - v0)
-        left, right = max(0, int(np.floor(u0 - margin))), min(width - 1, int(np.floor(u1 + margin)))
-        top, bottom = max(0, int(np.floor(v0 - margin))), min(height - 1, int(np.floor(v1 + margin)))
-        if left <= right and top <= bottom:
-            tiles[top // 4 : bottom // 4 + 1, left // 4 : right // 4 + 1] = True
-    for row in range(height):
-        for column in range(width):
-            marked[row, column] = tiles[row // 4, column // 4]
-    return marked
 
 
 def compose(

@@ -10,6 +10,7 @@ from numba import njit
 
 from data_tools.asset import AnimatedAsset
 from data_tools.solid_noise import fabric_noise, gradient_noise
+from geomocap.model.surface import vertex_normals
 
 MEAN_LEVEL = 125.0  # grey levels, of the subject under light of strength 1
 DARKEST, BRIGHTEST = 0.08, 0.85  # fractions of the light that black and white surfaces return, so that both show fabric
@@ -117,14 +118,7 @@ class ShadedSurface:
 
     def normals(self, vertices: np.ndarray) -> np.ndarray:
         """Smooth vertex normals, weighted by area, of a posed mesh: (V, 3) float64."""
-        triangles = vertices[self.faces]
-        face = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-        count = int(self.normals_group.max()) + 1
-        groups = self.normals_group[self.faces].ravel()
-        each = np.repeat(face, 3, axis=0)
-        total = np.column_stack([np.bincount(groups, each[:, k], count) for k in range(3)])
-        length = np.linalg.norm(total, axis=1, keepdims=True)
-        return (total / np.maximum(length, 1e-30))[self.normals_group]
+        return vertex_normals(vertices, self.faces, self.normals_group)
 
     def shade(self, normals: np.ndarray, triangles: np.ndarray, uvs: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Colours of surface points, (N, 3) float32, grey levels (not clipped).

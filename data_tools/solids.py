@@ -17,7 +17,7 @@ class Solid:
     faces : (F, 3) int, outward
     uv : (V, 2) float
     normals_group : (V,) int
-        Vertices with the same number fraction a smooth normal.
+        Vertices with the same number share a smooth normal.
     """
 
     vertices: np.ndarray

@@ -12,13 +12,14 @@ import numpy as np
 
 from geomocap.keypoints.keypoint_following import KeyPointPaths
 from geomocap.keypoints.keypoint_regions import KeyPointFile
+from geomocap.model.surface import outward_normals
 from viz.body_colors import hex_color
 from viz.drawing import resize
 from viz.keypoint_marks import BRIDGED, LOST, MEASURED, Marks, marked
 from viz.results import Results
 from viz.scene import stage as find_stage
 from viz.viewpoints import ViewStage
-from viz.volumes import smooth_normals, spacing
+from viz.volumes import spacing
 
 POINTS = 24_000
 """Points of the surface that are drawn at most."""
@@ -55,7 +56,7 @@ class SceneSurface:
         """Return the points with colours that show the surface's shape: darker where it faces to the side."""
         if len(self.points) < 4:
             return self
-        facing = np.abs(smooth_normals(self.points, 30) @ (_LIGHT / np.linalg.norm(_LIGHT)))
+        facing = np.abs(outward_normals(self.points) @ (_LIGHT / np.linalg.norm(_LIGHT)))
         bright = 255 * (self.colors / 255) ** 0.75
         return replace(self, colors=np.rint(bright * (0.7 + 0.3 * facing)[:, None]).astype(np.uint8))
 

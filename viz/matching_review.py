@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import open3d as o3d
 
 from geomocap.config import load_config
 from geomocap.dense import CloudFrame, TemplateCloud, undistorted_color
 from geomocap.errors import GeomocapError
 from geomocap.matching.growing import SurfaceMatches
+from geomocap.model.ray_casting import TriangleScene
 from geomocap.pipeline.cloud_stage import measure_again
 from viz.body_colors import ACCENT, INK, body_color
 from viz.drawing import faded, sheet, text_width, write_on
@@ -23,8 +23,6 @@ PARTLY = (230, 130, 20)
 
 REMOVED = (150, 15, 45)
 """Points that disagreed with their neighbours."""
-
-UNMATCHED = (176, 178, 182)
 
 _LOW, _MIDDLE, _HIGH = (34, 94, 168), (250, 240, 180), (178, 24, 43)
 
@@ -201,14 +199,9 @@ def surface_errors(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) 
     """Signed distances of points (N, 3) from a closed true surface, outside positive: (N,) float, metres."""
     if len(points) == 0:
         return np.zeros(0)
-    scene = o3d.t.geometry.RaycastingScene()
-    tensor = o3d.core.Tensor.from_numpy
-    scene.add_triangles(
-        tensor(np.ascontiguousarray(vertices, np.float32)), tensor(np.ascontiguousarray(faces, np.uint32))
-    )
-    nearest = scene.compute_closest_points(tensor(np.ascontiguousarray(points, np.float32)))
-    way = np.asarray(points) - nearest["points"].numpy()
-    side = np.einsum("ni,ni->n", way, nearest["primitive_normals"].numpy())
+    nearest, _, _, normals = TriangleScene(vertices, faces).closest(points)
+    way = np.asarray(points) - nearest
+    side = np.einsum("ni,ni->n", way, normals)
     return np.where(side >= 0, 1.0, -1.0) * np.linalg.norm(way, axis=1)
 
 

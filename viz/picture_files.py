@@ -9,12 +9,13 @@ import open3d as o3d
 
 from geomocap.errors import GeometryError, RunError
 from geomocap.files.open3d_geometry import read_by_open3d
+from geomocap.model.surface import vertex_normals
 from viz.body_colors import body_colors
 from viz.drawing import sheet, write_png
 from viz.floor import floor
 from viz.rendering import Model
 from viz.results import read_points
-from viz.shapes import Mesh, vertex_normals
+from viz.shapes import Mesh
 from viz.sheets import VIEWS, tile_size
 from viz.viewpoints import stage_of, up_vector
 from viz.volumes import cubes, gems, spacing

@@ -1,41 +1,10 @@
-"""Inner loops of rendering: the tiles that triangles may fall on, and the light of the points that rays hit."""
+"""Inner loop of rendering: the light of the points that rays hit."""
 
 from __future__ import annotations
 
 import math
 
 from numba import njit
-
-
-@njit(cache=True, nogil=True)
-def mark_tiles(pixels, faces, margin, tile, tiles):
-    """Set the tiles that the boxes of triangles meet.
-
-    Parameters
-    ----------
-    pixels : (V, 2) float
-        Corners, finite.
-    faces : (F, 3) int
-    margin : float
-        Pixels by which the boxes are made larger.
-    tile : int
-        Edge of a tile, pixels.
-    tiles : (rows, columns) bool
-        Set, never cleared.
-    """
-    rows, columns = tiles.shape
-    for f in range(len(faces)):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        left = min(pixels[a, 0], pixels[b, 0], pixels[c, 0]) - margin
-        right = max(pixels[a, 0], pixels[b, 0], pixels[c, 0]) + margin
-        top = min(pixels[a, 1], pixels[b, 1], pixels[c, 1]) - margin
-        bottom = max(pixels[a, 1], pixels[b, 1], pixels[c, 1]) + margin
-        if right < 0 or bottom < 0 or left >= columns * tile or top >= rows * tile:
-            continue
-        first, last = int(max(left, 0.0)) // tile, min(int(right) // tile, columns - 1)
-        for row in range(int(max(top, 0.0)) // tile, min(int(bottom) // tile, rows - 1) + 1):
-            for column in range(first, last + 1):
-                tiles[row, column] = True
 
 
 @njit(cache=True, nogil=True)

@@ -11,16 +11,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import open3d as o3d
 
-from viz.ray_kernels import mark_tiles, shade
+from geomocap.model.ray_casting import TriangleScene, touched_pixels
+from viz.ray_kernels import shade
 from viz.shapes import EMPTY, Mesh
 from viz.viewpoints import View
 
 PAPER = (255, 255, 255)
 """Background, RGB 0–255."""
-
-_STRIP = 1 << 20  # rays cast at once: bounds the memory
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,7 @@ class Layer:
 class _Surfaces:
     """Meshes as one ray casting scene with flat attribute arrays."""
 
-    scene: o3d.t.geometry.RaycastingScene
+    scene: TriangleScene
     faces: np.ndarray
     normals: np.ndarray
     colors: np.ndarray
@@ -83,13 +81,8 @@ def _surfaces(meshes: Sequence[Mesh]) -> _Surfaces | None:
         return None
     vertices, faces = _triangles(meshes)
     sizes = [len(m.faces) for m in meshes]
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor.from_numpy(vertices.astype(np.float32)), o3d.core.Tensor.from_numpy(faces.astype(np.uint32))
-    )
-    _cast(scene, np.zeros(3), np.ones((1, 3)))  # the first ray sorts the triangles: views may be rendered side by side
     return _Surfaces(
-        scene,
+        TriangleScene(vertices, faces),
         faces,
         np.concatenate([m.normals for m in meshes]).astype(np.float32),
         np.concatenate([m.colors for m in meshes]).astype(np.float32),
@@ -189,17 +182,10 @@ class _Rays:
 
 
 def _touched(vertices: np.ndarray, faces: np.ndarray, view: View) -> np.ndarray:
-    """Pixels (H, W) bool on which a triangle may fall: those of the 8 × 8 tiles that its box meets, and their edges."""
-    width, height = view.size
-    if not len(faces):
-        return np.zeros((height, width), bool)
+    """Pixels (H, W) bool on which a triangle may fall; all if something reaches behind the view."""
     pixels, depth = view.project(vertices)
-    if (depth <= 1e-6).any() or not np.isfinite(pixels).all():
-        return np.ones((height, width), bool)  # something reaches behind the view
-    tile = 8
-    tiles = np.zeros((-(-height // tile), -(-width // tile)), bool)
-    mark_tiles(np.ascontiguousarray(pixels), faces, 1.5, tile, tiles)
-    return np.repeat(np.repeat(tiles, tile, axis=0), tile, axis=1)[:height, :width]
+    pixels = np.where((depth > 1e-6)[:, None], pixels, np.nan)
+    return touched_pixels(pixels, faces, *view.size)
 
 
 @dataclass(frozen=True)
@@ -210,17 +196,9 @@ class _Near:
     distance: np.ndarray
 
 
-def _cast(
-    scene: o3d.t.geometry.RaycastingScene, origins: np.ndarray, directions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distances (N,), triangle numbers (N,) and barycentric coordinates (N, 2) of the first hits."""
-    rays = np.empty((len(directions), 6), np.float32)
-    rays[:, :3], rays[:, 3:] = origins, directions
-    parts = [scene.cast_rays(o3d.core.Tensor.from_numpy(rays[i : i + _STRIP])) for i in range(0, len(rays), _STRIP)]
-    distance, triangle, uv = (
-        np.concatenate([p[k].numpy() for p in parts]) for k in ("t_hit", "primitive_ids", "primitive_uvs")
-    )
-    return distance, triangle, uv
+def _rays(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Rays (N, 6) from origins (3,) or (N, 3) in directions (N, 3)."""
+    return np.concatenate([np.broadcast_to(origins, directions.shape), directions], axis=1)
 
 
 def _shade(
@@ -246,7 +224,7 @@ def _opaque(surfaces: _Surfaces | None, rays: _Rays, look: Look, up: np.ndarray 
     rgba = np.zeros((len(rays), 4), np.float32)
     if surfaces is None:
         return _Near(rgba, np.full(len(rays), np.inf, np.float32))
-    distance, triangle, uv = _cast(surfaces.scene, rays.origin, rays.directions)
+    distance, triangle, uv = surfaces.scene.cast(_rays(rays.origin, rays.directions))
     hit = np.isfinite(distance)
     if hit.any():
         triangle = triangle[hit]
@@ -302,7 +280,7 @@ def _peel(clear: _Surfaces, rays: _Rays, near: _Near, look: Look, up: np.ndarray
     for _ in range(look.layers):
         if len(alive) == 0:
             break
-        distance, triangle, uv = _cast(clear.scene, start[alive], rays.directions[alive])
+        distance, triangle, uv = clear.scene.cast(_rays(start[alive], rays.directions[alive]))
         seen = np.isfinite(distance) & (travelled[alive] + distance < near.distance[alive])
         alive, distance, triangle, uv = alive[seen], distance[seen], triangle[seen], uv[seen]
         if len(alive) == 0:

@@ -67,16 +67,6 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return area-weighted unit normals at the vertices, (V, 3)."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    n = np.cross(b - a, c - a)
-    total = np.column_stack(
-        [sum(np.bincount(faces[:, k], weights=n[:, d], minlength=len(vertices)) for k in range(3)) for d in range(3)]
-    ).reshape(-1, 3)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
-
-
 def _mesh(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, color: Color) -> Mesh:
     return Mesh(vertices, faces, normals, np.tile(np.asarray(color, float) / 255, (len(faces), 1)))
 

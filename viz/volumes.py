@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import open3d as o3d
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from viz.shapes import EMPTY, Mesh, vertex_normals
+from geomocap.model.surface import outward_normals, vertex_normals
+from viz.shapes import EMPTY, Mesh
 
 _SIDES = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
 _CORNERS = np.array(
@@ -30,15 +30,8 @@ def spacing(points: np.ndarray) -> float:
     return max(float(np.median(cKDTree(points).query(sample, k=2)[0][:, 1])), 1e-6)
 
 
-def smooth_normals(points: np.ndarray, neighbours: int = 30) -> np.ndarray:
-    """Return unit normals of points (N, 3) from their neighbours' plane; their sign means nothing."""
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(min(neighbours, len(points))), False)
-    return np.asarray(cloud.normals).copy()
-
-
 def cubes(indices: np.ndarray, origin: np.ndarray, size: float, colors: np.ndarray) -> Mesh:
-    """Return voxels as cubes, without the sides that two of them fraction.
+    """Return voxels as cubes, without the sides that two of them share.
 
     The shading normals lean towards the surface that the voxels together make, so that its shape shows as well.
 
@@ -57,7 +50,7 @@ def cubes(indices: np.ndarray, origin: np.ndarray, size: float, colors: np.ndarr
     local = indices - low
     filled = np.zeros(local.max(axis=0) + 2, bool)
     filled[tuple(local.T)] = True
-    smooth = smooth_normals((indices + 0.5) * size)
+    smooth = outward_normals((indices + 0.5) * size)
     vertices, normals, face_colors = [], [], []
     for side, corners in zip(_SIDES, _CORNERS, strict=True):
         free = ~filled[tuple((local + side).T)]
@@ -78,7 +71,7 @@ def gems(points: np.ndarray, colors: np.ndarray, radius: float, normals: np.ndar
     if len(points) == 0:
         return EMPTY
     if normals is None:
-        normals = smooth_normals(points) if len(points) > 3 else np.tile([0.0, 0.0, 1.0], (len(points), 1))
+        normals = outward_normals(points) if len(points) > 3 else np.tile([0.0, 0.0, 1.0], (len(points), 1))
     tips = np.concatenate([np.eye(3), -np.eye(3)])
     octants = np.array([(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)])
     vertices = (points[:, None] + radius * tips[None]).reshape(-1, 3)

@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.surface import plane_normals
 
 _VOTERS = 12
 _NEAREST = 3
@@ -42,20 +43,15 @@ def label_points(bodies: MotionBodies, paths: MotionPaths, frame: int, points: n
     trust = np.where(paths.seen[:, frame], 1.0, 0.3)
     spacing = float(np.median(cKDTree(bodies.rest).query(bodies.rest, 2)[0][:, 1]))
     shapes = [cKDTree(bodies.rest[bodies.label == b]) for b in range(bodies.body_count)]
-    normals = [_normals(shape) for shape in shapes]
+    # of either side
+    planes = [shape.query(shape.data, min(_PLANE, shape.n))[1].reshape(shape.n, -1) for shape in shapes]
+    normals = [plane_normals(shape.data, near) for shape, near in zip(shapes, planes, strict=True)]
     tree = cKDTree(samples)
     parts = [
         _label_some(bodies, frame, points[i : i + _CHUNK], tree, trust, shapes, normals, spacing)
         for i in range(0, len(points), _CHUNK)
     ]
     return np.concatenate(parts)
-
-
-def _normals(shape: cKDTree) -> np.ndarray:
-    """Normals of a body's surface at its samples, (n, 3), of either sign."""
-    around = shape.data[shape.query(shape.data, min(_PLANE, shape.n))[1].reshape(shape.n, -1)]
-    around = around - around.mean(axis=1, keepdims=True)
-    return np.linalg.eigh(np.einsum("nkc,nkd->ncd", around, around))[1][:, :, 0]
 
 
 def _label_some(

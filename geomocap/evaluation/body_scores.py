@@ -45,7 +45,7 @@ class LabelledFrame:
 def labelled_frame(run: Run, truth: Truth, frame: int) -> LabelledFrame:
     """Read a frame's bodies, and find the true body at the closest surface point of each."""
     points, found = read_labelled(run, "bodies", frame)
-    closest, face, corners = truth.surface(frame).closest(points)
+    closest, face, corners, _ = truth.surface(frame).closest(points)
     distance = np.linalg.norm(closest - points, axis=1)
     near = distance < NEAR_FRACTION * truth.height
     weights = truth.body_weights

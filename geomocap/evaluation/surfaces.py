@@ -28,7 +28,7 @@ def judge_surface(run: Run, truth: Truth, kind: Literal["voxels", "cloud"], fram
         points = read_geometry(run, kind, k)
         if points is None or not len(points):
             continue
-        closest, _, _ = truth.surface(k).closest(points)
+        closest = truth.surface(k).closest(points)[0]
         accuracy.append(np.linalg.norm(closest - points, axis=1) * 1000)
         completeness.append(cKDTree(points).query(truth.vertices[k])[0] * 1000)
         counts.append(len(points))

@@ -29,7 +29,7 @@ def judge_tracks(positions: np.ndarray, truth: Truth) -> Evaluation:
         ids = np.flatnonzero(tracked.any(axis=1) & (first == k))
         if not len(ids):
             continue
-        _, face, corners = truth.surface(k).closest(positions[ids, k])
+        _, face, corners, _ = truth.surface(k).closest(positions[ids, k])
         anchor = np.einsum("nk,tnkc->tnc", corners, truth.vertices[:, truth.faces[face]])
         start = positions[ids, k] - anchor[k]
         drift = np.linalg.norm(positions[ids, :T].transpose(1, 0, 2) - anchor[:T] - start, axis=-1) * 1000

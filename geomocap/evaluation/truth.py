@@ -7,9 +7,9 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 
 from geomocap.evaluation.result import EvaluationError
+from geomocap.model.ray_casting import TriangleScene
 from geomocap.model.rotations import turn_angles
 
 ACTIVE_DEG = 15.0  # a rig joint is active when its segment turns at least this much against its parent segment
@@ -138,40 +138,9 @@ class Truth:
         np.add.at(weights.T, self.bodies.of_joint, self.vertex_weights.T)
         return weights
 
-    def surface(self, frame: int) -> TrueSurface:
+    def surface(self, frame: int) -> TriangleScene:
         """Return the surface of a frame, for finding closest points."""
-        return TrueSurface(self.vertices[frame], self.faces)
-
-
-class TrueSurface:
-    """The mesh of one frame, in which closest points are found."""
-
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
-        self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(_tensor(vertices.astype(np.float32)), _tensor(faces.astype(np.uint32)))
-
-    def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Closest points on the surface.
-
-        Parameters
-        ----------
-        points : (N, 3) float
-
-        Returns
-        -------
-        closest : (N, 3) float
-        face : (N,) int
-        corner_weights : (N, 3) float
-            Of the face's corners.
-        """
-        found = self._scene.compute_closest_points(_tensor(points.astype(np.float32)))
-        uv = found["primitive_uvs"].numpy().astype(float)
-        corners = np.stack([1 - uv.sum(axis=1), uv[:, 0], uv[:, 1]], axis=1)
-        return found["points"].numpy(), found["primitive_ids"].numpy().astype(int), corners
-
-
-def _tensor(array: np.ndarray) -> o3d.core.Tensor:
-    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array))
+        return TriangleScene(self.vertices[frame], self.faces)
 
 
 def true_bodies(truth: Truth) -> TrueBodies:

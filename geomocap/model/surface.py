@@ -1,8 +1,8 @@
-"""A closed surface through the points of one frame.
+"""A closed surface through the points of one frame, and normals of points and meshes.
 
-Surface voxels have no normals: their shell is filled, smoothed, and its gradient taken. The surface is Open3D's
-screened Poisson reconstruction (Kazhdan & Hoppe 2013), trimmed where there are no points. Its resolution is halved
-until it has few enough triangles: they stay even, where simplification would leave long ones that bend badly.
+The surface is Open3D's screened Poisson reconstruction (Kazhdan & Hoppe 2013), trimmed where there are no points. Its
+resolution is halved until it has few enough triangles: they stay even, where simplification would leave long ones that
+bend badly.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from geomocap.export.export_errors import MotionError
 
 FEWEST_POINTS = 50
 MOST_CELLS = 40_000_000  # of the grid in which a shell is filled
+NEIGHBOURS = 16  # points that make a normal
+SHEET = 0.05  # fall a cell of a smoothed shell below which it tells no side; 0.27 at the surface of a solid
 COARSEST, FINEST = 4, 8  # depths of the octree
 TRIM = 3.0  # spacings or cells from the nearest point beyond which surface is invented
 SMALLEST_PART = 0.01  # fraction of the triangles; smaller parts are dirt
@@ -59,7 +61,7 @@ def surface_through(points: np.ndarray, normals: np.ndarray | None = None, max_t
         raise MotionError(f"skin: {len(points)} points are too few for a surface; choose another reference frame")
     spacing = point_spacing(points)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud.normals = o3d.utility.Vector3dVector(shell_normals(points, spacing) if normals is None else normals)
+    cloud.normals = o3d.utility.Vector3dVector(outward_normals(points) if normals is None else normals)
     diagonal = float(np.ptp(points, axis=0).max())
     finest = int(np.clip(np.ceil(np.log2(1.1 * diagonal / spacing)), COARSEST, FINEST))
     for depth in range(finest, COARSEST - 1, -1):
@@ -95,26 +97,70 @@ def point_spacing(points: np.ndarray) -> float:
     return float(np.median(positive))
 
 
-def shell_normals(points: np.ndarray, spacing: float) -> np.ndarray:
-    """Outward normals, (N, 3), of points that make a closed shell, from the gradient of the filled and smoothed shell.
+def plane_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Unit normals (M, 3) of the planes nearest to some of N points each, of either sign.
 
-    Where the gradient vanishes (leaves without a thickness) the direction from the centroid stands in.
+    Parameters
+    ----------
+    points : (N, 3) float, metres
+    near : (M, k) int
+        Points of each plane.
     """
-    low = points.min(axis=0) - 4.5 * spacing  # points of a grid lie in the middles of the cells
-    size = np.ceil((points.max(axis=0) - low) / spacing).astype(int) + 5
+    local = points[near] - points[near].mean(axis=1, keepdims=True)
+    return np.linalg.eigh(np.einsum("mki,mkj->mij", local, local))[1][:, :, 0]
+
+
+def outward_normals(points: np.ndarray) -> np.ndarray:
+    """Outward unit normals, (N, 3), of points of a surface: across the plane of the nearest ones, out of the shell.
+
+    A filled shell tells the side without doubt, but its slope follows the surface coarsely; planes are the other way
+    round (Hoppe et al. 1992, section 3.2).
+
+    Parameters
+    ----------
+    points : (N, 3) float, metres
+        Of a closed surface; where it is open they point away from the middle of all.
+    """
+    near = cKDTree(points).query(points, min(NEIGHBOURS + 1, len(points)))[1].reshape(len(points), -1)
+    normals = plane_normals(points, near)
+    reach = float(np.median(np.linalg.norm(points[near[:, -1]] - points, axis=1)))
+    inwards = (normals * _out_of_shell(points, max(reach, 1e-9))).sum(axis=1) < 0
+    return np.where(inwards[:, None], -normals, normals)
+
+
+def _out_of_shell(points: np.ndarray, cell: float) -> np.ndarray:
+    """Directions (N, 3) out of the shell that points make: how the filled and smoothed shell falls off.
+
+    Where it hardly does, as in the middle of a sheet, the direction from the centroid stands in.
+    """
+    low = points.min(axis=0) - 4.5 * cell
+    size = np.ceil((points.max(axis=0) - low) / cell).astype(int) + 5
     if np.prod(size.astype(float)) > MOST_CELLS:
-        spacing *= float((np.prod(size.astype(float)) / MOST_CELLS) ** (1 / 3))
-        size = np.ceil((points.max(axis=0) - low) / spacing).astype(int) + 5
+        cell *= float((np.prod(size.astype(float)) / MOST_CELLS) ** (1 / 3))
+        size = np.ceil((points.max(axis=0) - low) / cell).astype(int) + 5
     shell = np.zeros(size, bool)
-    cell = np.floor((points - low) / spacing).astype(int)
-    shell[tuple(cell.T)] = True
-    # Closing bridges single cells that the points' own grid left out of phase with this one.
+    shell[tuple(np.floor((points - low) / cell).astype(int).T)] = True
+    # Closing bridges single cells that hold no point by chance
     solid = ndimage.binary_fill_holes(ndimage.binary_closing(shell, iterations=1) | shell)
     smooth = ndimage.gaussian_filter(solid.astype(np.float32), 1.5)
-    place = ((points - low) / spacing - 0.5).T
-    gradient = [ndimage.map_coordinates(g, place, order=1) for g in np.gradient(smooth)]
-    normals = -np.stack(gradient, axis=1).astype(float)
-    length = np.linalg.norm(normals, axis=1)
-    outwards = points - points.mean(axis=0)
-    normals = np.where((length > 1e-6)[:, None], normals, outwards)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    place = ((points - low) / cell - 0.5).T
+    outwards = -np.stack([ndimage.map_coordinates(g, place, order=1) for g in np.gradient(smooth)], axis=1)
+    steep = np.linalg.norm(outwards, axis=1) > SHEET
+    return np.where(steep[:, None], outwards, points - points.mean(axis=0))
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray, groups: np.ndarray | None = None) -> np.ndarray:
+    """Unit normals at the vertices of a mesh, (V, 3), those of their triangles weighted by area.
+
+    Parameters
+    ----------
+    vertices, faces : (V, 3) float, (F, 3) int
+    groups : (V,) int, optional
+        Vertices of one group share a normal.
+    """
+    groups = np.arange(len(vertices)) if groups is None else groups
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    each = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    number = groups[faces].ravel()
+    total = np.column_stack([np.bincount(number, each[:, k], int(groups.max(initial=-1)) + 1) for k in range(3)])
+    return (total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30))[groups]

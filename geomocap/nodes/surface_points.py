@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.spatial import cKDTree
 
 from geomocap.errors import GeometryError
+from geomocap.model.surface import plane_normals
 
 _ROUNDS = 10  # in which votes on the side of normals spread to neighbours
 
@@ -116,7 +117,7 @@ def point_set(
 
 
 def oriented_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Normals by principal components, oriented along a minimum spanning tree and then outwards.
+    """Normals of planes, oriented along a minimum spanning tree and then outwards: open surfaces keep one side.
 
     Source: H. Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992, sections 3.2 and 3.3.
 
@@ -130,8 +131,7 @@ def oriented_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:
     -------
     (M, 3) float
     """
-    local = points[near] - points[near].mean(axis=1, keepdims=True)
-    normals = np.linalg.eigh(np.einsum("mki,mkj->mij", local, local))[1][:, :, 0]
+    normals = plane_normals(points, near)
     M, k = near.shape
     i, j = np.repeat(np.arange(M), k - 1), near[:, 1:].ravel()
     cost = 1 - np.abs((normals[i] * normals[j]).sum(axis=1)) + 1e-6

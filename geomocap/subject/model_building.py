@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.errors import GeometryError
-from geomocap.model.surface import shell_normals
+from geomocap.model.surface import outward_normals
 from geomocap.skeleton.body_observations import INFLUENCES, SkinPoints
 from geomocap.skeleton.kinematics import BodyMotion
 from geomocap.skeleton.motion_skeleton import MotionSkeleton
@@ -108,7 +108,7 @@ def _agreed_surface(
     clouds: list[BodyCloud], frames: np.ndarray, motion: BodyMotion, spacing: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Points, normals, colours and bodies of what the frames agree on, at rest."""
-    outward = [shell_normals(c.points, 2.0 * spacing) for c in clouds]
+    outward = [outward_normals(c.points) for c in clouds]
     size = CELL * spacing
     parts: list[tuple[np.ndarray, ...]] = []
     for b in range(motion.rotations.shape[1]):

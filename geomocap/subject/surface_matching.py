@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from geomocap.model.surface import shell_normals
+from geomocap.model.surface import outward_normals
 from geomocap.skeleton.body_observations import Observations, SkinPoints
 from geomocap.skeleton.kinematics import BodyMotion
 from geomocap.subject.subject_model import SubjectModel
@@ -99,7 +99,7 @@ class FrameSurface:
         cls, points: np.ndarray, colors: np.ndarray | None, spacing: float, scales: MatchingScales, count: int
     ) -> FrameSurface:
         """Prepare the points of a frame; `count` of them look for the model, which looks for `SOUGHT` times as many."""
-        surface = OrientedPoints(points, shell_normals(points, 2.0 * spacing), colors)
+        surface = OrientedPoints(points, outward_normals(points), colors)
         order = np.random.default_rng(0).permutation(len(points))
         some, sought = (surface.part(np.sort(order[:n])) for n in (count, SOUGHT * count))
         return cls(surface, sought, cKDTree(sought.features(scales)), some)

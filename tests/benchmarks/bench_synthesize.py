@@ -8,9 +8,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 
-from data_tools.camera_views import CameraView
+from data_tools.camera_views import PixelRays
 from data_tools.figure import figure
 from data_tools.image_rendering import PosedSubject, expose, render_subject
 from data_tools.shading import ShadedSurface
@@ -27,7 +26,7 @@ def benchmark() -> list[Row]:
     vertices = np.array([asset.vertices(t) for t in np.arange(FRAMES) / settings.fps])
     world = make_world(vertices, settings)
     surface = ShadedSurface.of(asset, world.footprint, settings.texture_contrast, 0)
-    subject, view = PosedSubject.of(surface, vertices[0]), CameraView.of(world.rig, 0)
+    subject, view = PosedSubject.of(surface, vertices[0]), PixelRays.of(world.rig, 0)
     everywhere = np.arange(settings.width * settings.height)
     light = np.full((settings.height, settings.width, 3), 100, np.float32)
 
@@ -35,7 +34,7 @@ def benchmark() -> list[Row]:
         render_subject(subject, surface, world.rig, 0, view, world.light)
 
     def all_pixels() -> None:
-        subject.scene.cast_rays(o3d.core.Tensor.from_numpy(view.rays(everywhere, 2)))
+        subject.scene.cast(view.rays(everywhere, 2).reshape(-1, 6))
 
     once, frame = min((_capture(settings) for _ in range(2)), key=sum)
     return [

@@ -9,7 +9,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from data_tools.asset import WORLD_FROM_GLTF, AssetError
-from data_tools.gltf_reader import animation_names, load_gltf
+from data_tools.gltf_reader import load_gltf
 from tests.data_tools.gltf_writer import GltfWriter
 
 TURN = WORLD_FROM_GLTF[:3, :3]
@@ -236,7 +236,6 @@ def test_wrong_files_and_animations_are_named(tmp_path: Path) -> None:
     writer = rigid_triangle()
     writer.animate(0, "translation", [0, 1], [[0, 0, 0], [1, 0, 0]], name="walk")
     path = writer.write(tmp_path / "c.gltf")
-    assert animation_names(path) == ("walk",)
     with pytest.raises(AssetError, match=r"no animation 'run'; it has walk"):
         load_gltf(path, "run")
     assert load_gltf(path, 0).duration == load_gltf(path, "walk").duration == 1

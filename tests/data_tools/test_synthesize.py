@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from data_tools.bar import BarRecording, picture_bar
-from data_tools.camera_views import CameraView, look_at
+from data_tools.camera_views import PixelRays, look_at
 from data_tools.figure import figure
-from data_tools.image_rendering import PosedSubject, candidate_pixels, render_subject
+from data_tools.image_rendering import PosedSubject, render_subject
 from data_tools.placement import make_camera
 from data_tools.room import Light
 from data_tools.shading import ShadedSurface
@@ -18,6 +18,7 @@ from data_tools.solid_noise import fabric_noise, gradient_noise
 from data_tools.synthesize import SynthesisResult, SynthesisSettings, make_world, synthesize
 from geomocap.errors import CaptureError
 from geomocap.files.capture import Capture
+from geomocap.model.ray_casting import touched_pixels
 from geomocap.model.rig import Rig
 from geomocap.scheduling import threads
 
@@ -47,7 +48,7 @@ def digest(folder: Path) -> dict[str, str]:
 def test_rays_of_a_pixel_are_centred_on_it() -> None:
     camera = make_camera(320, 240, 60, 2.0, np.random.default_rng(0))
     rig = Rig(("a",), (camera,), look_at(np.array([3.0, 1, 2]), np.zeros(3))[None])
-    view = CameraView.of(rig, 0)
+    view = PixelRays.of(rig, 0)
     pixels = np.array([0, 319, 120 * 320 + 160, 239 * 320])
     for samples in (1, 2, 4):
         rays = view.rays(pixels, samples).astype(np.float64)
@@ -60,20 +61,18 @@ def test_rays_of_a_pixel_are_centred_on_it() -> None:
         np.testing.assert_allclose(rays[..., 3:] @ rig.viewing_directions[0], 1, atol=1e-6)  # unit depth
 
 
-def test_candidate_pixels_hold_all_that_is_hit() -> None:
+def test_touched_pixels_hold_all_that_is_hit() -> None:
     vertices = figure().vertices(0.2)
     world = make_world(vertices[None], SMALL)
     surface = ShadedSurface.of(figure(), world.footprint, 0.28, 0)
     subject = PosedSubject.of(surface, vertices)
     for c in range(len(world.rig)):
-        view = CameraView.of(world.rig, c)
+        view = PixelRays.of(world.rig, c)
         everything = np.arange(160 * 120)
         rays = view.rays(everything, 4).reshape(-1, 6)
-        import open3d as o3d
-
-        hit = subject.scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].isfinite().numpy().reshape(-1, 16)
-        marked = candidate_pixels(world.rig.project(vertices)[c], surface.faces, 160, 120)
-        assert set(np.flatnonzero(hit.any(axis=1))) <= set(marked)
+        hit = np.isfinite(subject.scene.cast(rays)[0]).reshape(-1, 16)
+        touched = touched_pixels(world.rig.project(vertices)[c], surface.faces, 160, 120)
+        assert touched.ravel()[hit.any(axis=1)].all()
         # And the coverage is that of all these rays
         pixels, coverage, _ = render_subject(subject, surface, world.rig, c, view, Light.studio())
         full = np.zeros(160 * 120)
@@ -223,7 +222,7 @@ def test_centroids_of_targets_are_their_centres(size: tuple[int, int], monkeypat
     dark = np.zeros((size[1], size[0], 3), np.float32)
     errors = []
     for c in range(len(world.rig)):
-        view = CameraView.of(world.rig, c)
+        view = PixelRays.of(world.rig, c)
         for pair in bar.targets:
             image = picture_bar(dark, view, world.rig, c, pair, bar.radius)[:, :, 0]
             both = world.rig.project(pair)[c]

@@ -9,7 +9,7 @@ from geomocap.export.file_rotations import rotation_about
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.skin import majority, node_of_body, skin_from_run, skin_weights
 from geomocap.files.run import Run
-from geomocap.model.surface import Surface, point_spacing, shell_normals, surface_through
+from geomocap.model.surface import Surface, outward_normals, point_spacing, surface_through
 
 VOXEL = 0.02
 RADIUS = 0.1
@@ -67,7 +67,7 @@ def arm_run(tmp_path_factory):
 
 def test_normals_of_a_shell_look_outwards():
     points = arm_shell()
-    normals = shell_normals(points, VOXEL)
+    normals = outward_normals(points)
     axis = np.stack([np.clip(points[:, 0], 0, 1), 0 * points[:, 0], 0 * points[:, 0]], -1)
     outward = points - axis
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from geomocap.model.ray_casting import touched_pixels
 from geomocap.model.rig import Rig
-from viz.ray_kernels import mark_tiles, shade
+from viz.ray_kernels import shade
 from viz.rendering import Layer, Look, Model, render
 from viz.shapes import EMPTY, ball, ellipsoid, tube
 from viz.viewpoints import CameraView, PinholeView, ViewStage, camera_view, look, stage_of
@@ -193,10 +194,11 @@ def test_shading_kernel_agrees_with_numpy() -> None:
 def test_marked_tiles_are_those_that_boxes_meet(seed: int, spread: float) -> None:
     rng = np.random.default_rng(seed)
     pixels, faces = rng.uniform(-60, 160, (1, 2)) + rng.normal(size=(20, 2)) * spread, rng.integers(0, 20, (15, 3))
-    rows, columns, tile, margin = 9, 12, 8, 1.5
-    tiles = np.zeros((rows, columns), bool)
-    mark_tiles(pixels, faces, margin, tile, tiles)
-    low, high = pixels[faces].min(axis=1) - margin, pixels[faces].max(axis=1) + margin
+    rows, columns, tile = 18, 24, 4
+    tiles = touched_pixels(pixels, faces, columns * tile - 2, rows * tile - 1)[::tile, ::tile]
+    low, high = pixels[faces].min(axis=1), pixels[faces].max(axis=1)
+    margin = 1.5 + 0.03 * (high - low).max(axis=1, keepdims=True)
+    low, high = low - margin, high + margin
     left, top = np.arange(columns) * tile, np.arange(rows) * tile
     across = (low[:, :1] < left + tile) & (high[:, :1] >= left)
     down = (low[:, 1:] < top + tile) & (high[:, 1:] >= top)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from viz.shapes import Mesh, ball, bone, ellipsoid, join, tube, vertex_normals
+from geomocap.model.surface import vertex_normals
+from viz.shapes import Mesh, ball, bone, ellipsoid, join, tube
 from viz.volumes import cubes, gems, skin, spacing, surface_nets
 
 
