@@ -110,8 +110,8 @@ def plane_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:
     return np.linalg.eigh(np.einsum("mki,mkj->mij", local, local))[1][:, :, 0]
 
 
-def outward_normals(points: np.ndarray) -> np.ndarray:
-    """Outward unit normals, (N, 3), of points of a surface: across the plane of the nearest ones, out of the shell.
+def outward_normals(points: np.ndarray, at: np.ndarray | None = None) -> np.ndarray:
+    """Outward unit normals, (M, 3), at points of a surface: across the plane of the nearest ones, out of the shell.
 
     A filled shell tells the side without doubt, but its slope follows the surface coarsely; planes are the other way
     round (Hoppe et al. 1992, section 3.2).
@@ -120,11 +120,14 @@ def outward_normals(points: np.ndarray) -> np.ndarray:
     ----------
     points : (N, 3) float, metres
         Of a closed surface; where it is open they point away from the middle of all.
+    at : (M,) int, optional
+        Points whose normals are wanted; all if not given.
     """
-    near = cKDTree(points).query(points, min(NEIGHBOURS + 1, len(points)))[1].reshape(len(points), -1)
+    at = np.arange(len(points)) if at is None else at
+    near = cKDTree(points).query(points[at], min(NEIGHBOURS + 1, len(points)))[1].reshape(len(at), -1)
     normals = plane_normals(points, near)
-    reach = float(np.median(np.linalg.norm(points[near[:, -1]] - points, axis=1)))
-    inwards = (normals * _out_of_shell(points, max(reach, 1e-9))).sum(axis=1) < 0
+    reach = float(np.median(np.linalg.norm(points[near[:, -1]] - points[at], axis=1)))
+    inwards = (normals * _out_of_shell(points, max(reach, 1e-9))[at]).sum(axis=1) < 0
     return np.where(inwards[:, None], -normals, normals)
 
 

@@ -130,7 +130,7 @@ def follow_model(
         settings.independence,
     )
     views = [_view(*read(t), t, spacing, scales, settings.points) for t in range(frames)]
-    colored = all(v.surface.colors is not None for v in views)
+    colored = all(v.sought.colors is not None for v in views)
     surface = ModelSurface.of_model(model, settings.points, colored)
     # Where it is
     asked = np.unique(np.linspace(0, frames, settings.start_frames, endpoint=False).astype(int)).tolist()

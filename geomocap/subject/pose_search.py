@@ -116,13 +116,13 @@ def _starts(model: SubjectModel, coarse: ModelSurface, frame: FrameSurface, up: 
     count, root = len(model.poses), model.root
     seen = JointMotion(model.poses, np.tile(linkage.origin, (count, 1)))
     places = [s.points for s in coarse.posed(body_motion(linkage, seen))]
-    middle = frame.surface.points.mean(axis=0)
+    middle = frame.points.mean(axis=0)
     axis = np.eye(3)[up]
     headings = Rotation.from_rotvec(np.arange(HEADINGS)[:, None] * (2 * np.pi / HEADINGS) * axis).as_matrix()
     local, path = [], []
     for k in range(count):
         own = places[k].mean(axis=0)
-        for turn in [*headings, *_aligning(places[k], frame.surface.points)]:
+        for turn in [*headings, *_aligning(places[k], frame.points)]:
             pose = model.poses[k].copy()
             pose[root] = turn @ pose[root]
             local.append(pose)

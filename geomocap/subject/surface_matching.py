@@ -80,7 +80,7 @@ class FrameSurface:
 
     Attributes
     ----------
-    surface : OrientedPoints
+    points : (N, 3) float, metres
     sought : OrientedPoints
         A part of the points, spread over all, among which points of the model look for their nearest.
     tree : cKDTree
@@ -89,7 +89,7 @@ class FrameSurface:
         A part of the points, spread over all, that looks for its own nearest points of the model.
     """
 
-    surface: OrientedPoints
+    points: np.ndarray
     sought: OrientedPoints
     tree: cKDTree
     some: OrientedPoints
@@ -99,10 +99,11 @@ class FrameSurface:
         cls, points: np.ndarray, colors: np.ndarray | None, spacing: float, scales: MatchingScales, count: int
     ) -> FrameSurface:
         """Prepare the points of a frame; `count` of them look for the model, which looks for `SOUGHT` times as many."""
-        surface = OrientedPoints(points, outward_normals(points), colors)
         order = np.random.default_rng(0).permutation(len(points))
-        some, sought = (surface.part(np.sort(order[:n])) for n in (count, SOUGHT * count))
-        return cls(surface, sought, cKDTree(sought.features(scales)), some)
+        rows = np.sort(order[: SOUGHT * count])
+        sought = OrientedPoints(points[rows], outward_normals(points, rows), None if colors is None else colors[rows])
+        some = sought.part(np.isin(rows, order[:count]))
+        return cls(points, sought, cKDTree(sought.features(scales)), some)
 
 
 @dataclass(frozen=True)
@@ -186,6 +187,6 @@ def misfit(posed: OrientedPoints, frame: FrameSurface, scales: MatchingScales) -
 
 def distance_between(posed: OrientedPoints, frame: FrameSurface) -> float:
     """Distance of two surfaces, metres: root mean square of the nearest points' distances, both directions."""
-    there = cKDTree(frame.surface.points).query(posed.points)[0]
+    there = cKDTree(frame.points).query(posed.points)[0]
     back = cKDTree(posed.points).query(frame.some.points)[0]
     return float(np.sqrt(0.5 * ((there**2).mean() + (back**2).mean())))
