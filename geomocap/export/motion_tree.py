@@ -13,6 +13,7 @@ import numpy as np
 
 from geomocap.export.conventions import Axis, Convention
 from geomocap.export.export_errors import MotionError
+from geomocap.model.hierarchy import Hierarchy
 
 
 @dataclass(frozen=True)
@@ -89,13 +90,8 @@ class MotionTree:
 
     def forward_kinematics(self) -> tuple[np.ndarray, np.ndarray]:
         """World rotations (T, N, 3, 3) and origins (T, N, 3), metres, of all nodes."""
-        R, p = np.empty(self.rotations.shape), np.empty(self.translations.shape)
-        R[:, 0], p[:, 0] = self.rotations[:, 0], self.translations[:, 0]
-        for n in range(1, self.n_nodes):
-            q = self.parents[n]
-            R[:, n] = R[:, q] @ self.rotations[:, n]
-            p[:, n] = p[:, q] + np.einsum("tij,tj->ti", R[:, q], self.translations[:, n])
-        return R, p
+        tree = Hierarchy(0, np.column_stack([self.parents[1:], np.arange(1, self.n_nodes)]))
+        return tree.forward_kinematics(self.rotations, self.translations)
 
     def converted(self, convention: Convention) -> MotionTree:
         """Return the same motion in a file's axes and unit (lengths are no longer metres unless its unit is)."""

@@ -1,4 +1,4 @@
-"""Which bodies are connected: a tree."""
+"""Which bodies are connected: a tree, and how its parts carry each other."""
 
 from __future__ import annotations
 
@@ -44,3 +44,26 @@ class Hierarchy:
         parents = np.full(len(self.joint_bodies) + 1, -1, np.int32)
         parents[self.joint_bodies[:, 1]] = self.joint_bodies[:, 0]
         return parents
+
+    def forward_kinematics(self, rotations: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations and origins of all bodies in the world.
+
+        Parameters
+        ----------
+        rotations : (T, B, 3, 3) float
+            Parent from child; of the root, world from root.
+        offsets : (B, 3) or (T, B, 3) float, metres
+            Origin of each body in its parent's axes, from the parent's origin; of the root, in the world.
+
+        Returns
+        -------
+        rotations : (T, B, 3, 3) float
+            World from body.
+        origins : (T, B, 3) float, metres, world
+        """
+        world = rotations.copy()
+        origins = np.broadcast_to(offsets, rotations.shape[:3]).copy()
+        for parent, child in self.joint_bodies:
+            world[:, child] = world[:, parent] @ rotations[:, child]
+            origins[:, child] = origins[:, parent] + (world[:, parent] @ origins[:, child, :, None])[..., 0]
+        return world, origins

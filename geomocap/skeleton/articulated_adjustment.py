@@ -1,7 +1,7 @@
 """Articulated adjustment: degrees of freedom of all frames, and the joints' places, by least squares together.
 
 Levenberg–Marquardt. The normal equations are banded in time (the temporal prior reaches two frames back), with the
-joints' places, which all frames fraction, as a border (Triggs et al., Bundle Adjustment, 2000, section 6).
+joints' places, which all frames share, as a border (Triggs et al., Bundle Adjustment, 2000, section 6).
 """
 
 from __future__ import annotations

@@ -50,14 +50,10 @@ def forward_kinematics(
     joint_positions : (T, J, 3) float, metres, world
     body_rotations : (T, B, 3, 3) float, world
     """
-    world = rotations.copy()
-    positions = np.empty((len(rotations), len(offsets), 3))
-    own = hierarchy.body_joints
-    for j, (parent, child) in enumerate(hierarchy.joint_bodies):
-        start = root_positions if own[parent] < 0 else positions[:, own[parent]]
-        positions[:, j] = start + world[:, parent] @ offsets[j]
-        world[:, child] = world[:, parent] @ rotations[:, child]
-    return positions, world
+    origins = np.empty(rotations.shape[:3])
+    origins[:, hierarchy.root], origins[:, hierarchy.joint_bodies[:, 1]] = root_positions, offsets
+    world, origins = hierarchy.forward_kinematics(rotations, origins)
+    return origins[:, hierarchy.joint_bodies[:, 1]], world
 
 
 def fit_offsets(

@@ -133,18 +133,16 @@ class BodyMotion:
 
 def body_motion(linkage: Linkage, motion: JointMotion) -> BodyMotion:
     """Motion of all bodies from the joints' (forward kinematics)."""
-    root = linkage.hierarchy.root
-    rotations = np.empty_like(motion.local)
-    translations = np.empty((*motion.local.shape[:2], 3))
-    rotations[:, root] = motion.local[:, root]
-    translations[:, root] = motion.root - rotations[:, root] @ linkage.origin
-    for j, (parent, child) in enumerate(linkage.hierarchy.joint_bodies):
-        rotations[:, child] = rotations[:, parent] @ motion.local[:, child]
-        turned = rotations[:, parent] - rotations[:, child]
-        translations[:, child] = translations[:, parent] + turned @ linkage.joints[j]
-        if motion.slip is not None:
-            translations[:, child] += np.einsum("tij,tj->ti", rotations[:, parent], motion.slip[:, j])
-    return BodyMotion(rotations, translations)
+    tree, children = linkage.hierarchy, linkage.hierarchy.joint_bodies[:, 1]
+    # Every body's origin is its joint
+    places = np.empty((linkage.body_count, 3))
+    places[tree.root], places[children] = linkage.origin, linkage.joints
+    offsets = np.repeat((places - places[np.maximum(tree.parents, 0)])[None], motion.frames, axis=0)
+    offsets[:, tree.root] = motion.root
+    if motion.slip is not None:
+        offsets[:, children] += motion.slip
+    rotations, origins = tree.forward_kinematics(motion.local, offsets)
+    return BodyMotion(rotations, origins - np.einsum("tbij,bj->tbi", rotations, places))
 
 
 def joint_motion(linkage: Linkage, rotations: np.ndarray, root: np.ndarray) -> JointMotion:

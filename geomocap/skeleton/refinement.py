@@ -35,7 +35,9 @@ _SETTLE_ROUNDS = 3
 class RefinementSettings(Settings):
     """How the motion of connected bodies is refined over all frames."""
 
-    rounds: int = Field(default=3, ge=1, description="rounds of skin weights, shape, and motion with joints")
+    rounds: int = Field(
+        default=3, ge=0, description="rounds of skin weights, shape, and motion with joints; 0: no refinement"
+    )
     steps: int = Field(default=4, ge=1, description="steps of each adjustment of motion and joints")
     independence: float = Field(
         default=0.3, gt=0, le=1, description="fraction of the observations that err independently of each other (0..1)"
@@ -116,6 +118,9 @@ def refine_skeleton(
     MotionBodies
         With refined motion, rest and weights; labels stay.
     """
+    settings = settings or RefinementSettings()
+    if settings.rounds == 0:
+        return found, bodies
     linkage, motion = linkage_of(found)
     points = SkinPoints.of_weights(bodies.rest, bodies.weights)
     misses = np.array([joint.miss for joint in found.joints])

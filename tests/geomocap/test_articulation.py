@@ -15,7 +15,7 @@ from geomocap.skeleton.body_observations import Observations, SkinPoints
 from geomocap.skeleton.kinematics import Linkage, body_motion, joint_motion, moved_by, posed, since
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
 from geomocap.skeleton.motion_smoothness import Smoothness, accelerations
-from geomocap.skeleton.refinement import refine_motion, refine_skeleton
+from geomocap.skeleton.refinement import RefinementSettings, refine_motion, refine_skeleton
 from geomocap.skeleton.skinning import candidates_near, fit_fractions
 from tests.geomocap.moving_chains import Chain, chain, seen_by_single_cameras
 
@@ -140,7 +140,7 @@ def test_poses_and_joints_are_recovered():
     assert np.sqrt(np.maximum(across, 0)).max() < 2e-4  # along a hinge every point is common
 
 
-def test_frames_without_sightings_are_bridged():
+def test_frames_without_observations_are_bridged():
     scene = chain(3, frames=60, turn_deg=30.0)
     linkage, motion, points = linked(scene)
     seen = scene.positions.copy()
@@ -323,3 +323,10 @@ def test_perfect_paths_are_not_made_worse_and_results_repeat():
     again = refine_motion(linkage, motion, points, paths, 1.3)
     np.testing.assert_array_equal(found.bodies.rotations, again.bodies.rotations)
     np.testing.assert_array_equal(found.points.fractions, again.points.fractions)
+
+
+def test_no_rounds_mean_no_change():
+    paths = MotionPaths(chain(2).positions)
+    bodies = find_motion_bodies(paths)
+    found = find_motion_skeleton(bodies, 30.0)
+    assert refine_skeleton(found, bodies, paths, RefinementSettings(rounds=0)) == (found, bodies)
