@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from geomocap.model.palette import BODY_COLORS, UNASSIGNED, body_color, body_colors
+from geomocap.model.palette import BODY_COLORS, UNASSIGNED, body_color, body_colors, hex_color
 
 __all__ = ["ACCENT", "BODY_COLORS", "INK", "UNASSIGNED", "body_color", "body_colors", "hex_color"]
 
@@ -11,8 +11,3 @@ INK = (34, 40, 49)
 
 ACCENT = (31, 95, 139)
 """Curves and lines that stand for no body, RGB 0–255."""
-
-
-def hex_color(color: tuple[int, int, int]) -> str:
-    """Return an RGB colour as `#rrggbb`."""
-    return "#{:02x}{:02x}{:02x}".format(*color)

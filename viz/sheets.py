@@ -81,11 +81,11 @@ def geometry_sheet(
     results: Results, stage: ViewStage, frames: Sequence[int], build: Builder, views: Sequence[str] = tuple(VIEWS)
 ) -> np.ndarray:
     """Return a sheet of one kind of geometry: frames as columns, free views as rows."""
-    sights = [stage.view(*VIEWS[v], tile_size(stage, *VIEWS[v])) for v in views]
+    seen_from = [stage.view(*VIEWS[v], tile_size(stage, *VIEWS[v])) for v in views]
 
     def column(frame: int) -> list[np.ndarray]:
         model = Model(build(results, frame))
-        return [picture(results, stage, model, ray, frame) for ray in sights]
+        return [picture(results, stage, model, view, frame) for view in seen_from]
 
     with threads() as executor:
         columns = list(map_items(column, list(frames), executor))
@@ -96,8 +96,8 @@ def geometry_sheet(
 def path_sheet(results: Results, stage: ViewStage, frame: int) -> np.ndarray:
     """Return the paths of the whole sequence, views beside each other, with the volume of one frame as glass."""
     model = Model(path_meshes(results, frame))
-    sights = [stage.view(*angles, tile_size(stage, *angles, 130_000)) for angles in VIEWS.values()]
-    return sheet([[picture(results, stage, model, ray, frame) for ray in sights]], (), tuple(VIEWS))
+    seen_from = [stage.view(*angles, tile_size(stage, *angles, 130_000)) for angles in VIEWS.values()]
+    return sheet([[picture(results, stage, model, view, frame) for view in seen_from]], (), tuple(VIEWS))
 
 
 def story_sheet(

@@ -155,14 +155,14 @@ def _background(
     low = np.maximum(np.nanpercentile(pixel, 0.5, axis=0) - 0.04 * max(whole.size), 0)
     high = np.minimum(np.nanpercentile(pixel, 99.5, axis=0) + 0.04 * max(whole.size), whole.size)
     scale = longest_side / float((high - low).max())
-    cut = _Cut(whole, low, scale, (int((high - low)[0] * scale), int((high - low)[1] * scale)))
+    cut = _Enlarged(whole, low, scale, (int((high - low)[0] * scale), int((high - low)[1] * scale)))
     x, y = low.astype(int)
     part = capture.frame(name, frame)[y : int(high[1]), x : int(high[0])]
     return faded(resize(np.ascontiguousarray(part), cut.size), 0.55), cut
 
 
 @dataclass(frozen=True)
-class _Cut:
+class _Enlarged:
     """A part of a view, enlarged."""
 
     whole: View

@@ -63,11 +63,6 @@ class Convention:
         """Convert a file's points, (..., 3), back into world metres; the inverse of `points`."""
         return (points / self.scale) @ file_from_world(world_up, self.up)
 
-    def world_rotations(self, rotations: np.ndarray, world_up: Axis) -> np.ndarray:
-        """Convert a file's rotations, (..., 3, 3), back to world axes; the inverse of `rotations`."""
-        turn = file_from_world(world_up, self.up)
-        return turn.T @ rotations @ turn
-
 
 def file_from_world(world_up: Axis, file_up: Axis) -> np.ndarray:
     """Return the rotation, (3, 3), that takes a world with axis `world_up` up to one with `file_up` up."""

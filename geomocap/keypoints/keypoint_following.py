@@ -108,7 +108,7 @@ def follow_keypoints(
 
 
 @dataclass(frozen=True)
-class _Pose:
+class _Placement:
     """Where the key-point is in a frame: its axes and place in the world, and the variance of the place."""
 
     turn: np.ndarray
@@ -126,8 +126,8 @@ def _follow(measured: Measured, center: np.ndarray, radius: float, order: range,
     local = np.full((N, 3), np.nan)  # places of trajectories in the key-point's axes
     joined = np.full(N, np.inf)  # variance of the key-point's place when they joined; infinite for those that haven't
     misfit = np.zeros(N)  # largest so far, squared
-    pose = _Pose(np.eye(3), center, 0.0)
-    last: tuple[int, _Pose] | None = None
+    pose = _Placement(np.eye(3), center, 0.0)
+    last: tuple[int, _Placement] | None = None
     for t in order:
         x = measured.places[t]
         seen = np.isfinite(x[:, 0])
@@ -165,7 +165,9 @@ def _follow(measured: Measured, center: np.ndarray, radius: float, order: range,
         last = t, pose
 
 
-def _fit(local: np.ndarray, world: np.ndarray, variance: np.ndarray, last_turn: np.ndarray) -> tuple[_Pose, np.ndarray]:
+def _fit(
+    local: np.ndarray, world: np.ndarray, variance: np.ndarray, last_turn: np.ndarray
+) -> tuple[_Placement, np.ndarray]:
     """Fit world = R local + t robustly, and return it with the misfits (N,). With fewer than three points R stays."""
     weight, turn = 1 / variance, last_turn
     for _ in range(6):
@@ -178,4 +180,4 @@ def _fit(local: np.ndarray, world: np.ndarray, variance: np.ndarray, last_turn: 
         weight = 1 / (variance + miss**2)
     # trajectories all on one side share what the skin between does
     aside = float(np.linalg.norm(weight @ local)) / float(weight.sum())
-    return _Pose(turn, place, 1 / float(weight.sum()) + (_SOFT * aside) ** 2), miss
+    return _Placement(turn, place, 1 / float(weight.sum()) + (_SOFT * aside) ** 2), miss

@@ -63,7 +63,7 @@ def group_nodes(forms: MotionForms, edges: np.ndarray, largest_misfit: float, le
     -------
     (N,) int, from 0
     """
-    state = _Groups(forms)
+    state = _NodeGroups(forms)
     neighbours: list[set[int]] = [set() for _ in range(len(forms.R))]
     for i, j in edges.tolist():
         neighbours[i].add(j)
@@ -96,7 +96,7 @@ def group_nodes(forms: MotionForms, edges: np.ndarray, largest_misfit: float, le
     return np.unique(label, return_inverse=True)[1]
 
 
-class _Groups:
+class _NodeGroups:
     """Forms of groups of nodes, that of a joined pair in the place of its first."""
 
     def __init__(self, forms: MotionForms):

@@ -126,7 +126,7 @@ def _some(rows: np.ndarray, most: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Places:
+class _FoundPlaces:
     """Where m patches of a piece were found from K motions: (K, m, 3) and (K, m, 3, 3)."""
 
     positions: np.ndarray
@@ -140,7 +140,7 @@ def _compare(
     view: FrameViews,
     slack: np.ndarray,
     iterations: tuple[int, int],
-) -> tuple[np.ndarray, _Places]:
+) -> tuple[np.ndarray, _FoundPlaces]:
     """Align the m patches of a piece from K motions: correlations (K, m), 0 where not seen, and where they are."""
     K, m = len(turns), len(piece)
     rows = np.tile(np.arange(m), K)
@@ -161,7 +161,7 @@ def _compare(
         prior_turn=_TURN,
     )
     value = np.maximum(at.correlation, 0.0).reshape(K, m)
-    return value, _Places(at.positions.reshape(K, m, 3), at.frames.reshape(K, m, 3, 3))
+    return value, _FoundPlaces(at.positions.reshape(K, m, 3), at.frames.reshape(K, m, 3, 3))
 
 
 def _promising(

@@ -14,7 +14,7 @@ _PLACED_PX = 0.1
 
 
 @dataclass(frozen=True)
-class _Measured:
+class _FramePatches:
     """Patches measured in one frame."""
 
     frame: int
@@ -32,7 +32,7 @@ class TrackRecord:
 
     def __init__(self, n_frames: int) -> None:
         self.n_frames = n_frames
-        self._measured: list[_Measured] = []
+        self._measured: list[_FramePatches] = []
         self._placed: list[tuple[int, np.ndarray, np.ndarray]] = []
         self._ends: list[tuple[bool, np.ndarray, np.ndarray]] = []
 
@@ -42,7 +42,7 @@ class TrackRecord:
         """Keep what cameras at `centers` found of patches `identity` (A,), the `rows` (A,) of an alignment."""
         alone = np.where(found.n_views[rows] == 1, found.by_camera[rows].argmax(axis=1), -1)
         self._measured.append(
-            _Measured(
+            _FramePatches(
                 frame,
                 identity,
                 found.positions[rows],
@@ -74,7 +74,7 @@ class TrackRecord:
         blind = np.where(views == 1, np.sqrt((2 * _PLACED_PX**2 + DEPTH_PX**2) / 3), _PLACED_PX)
         ray = _ray(patches.positions, alone, centers)
         self._measured.append(
-            _Measured(frame, identity, patches.positions, patches.frames, blind * patches.size, one, views, ray)
+            _FramePatches(frame, identity, patches.positions, patches.frames, blind * patches.size, one, views, ray)
         )
 
     def ended(self, identity: np.ndarray, reason: np.ndarray, forward: bool) -> None:

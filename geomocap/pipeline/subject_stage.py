@@ -1,4 +1,4 @@
-"""The subject's own model, made from a take: `model.npz`."""
+"""The subject's own model, made from a sequence: `model.npz`."""
 
 from __future__ import annotations
 

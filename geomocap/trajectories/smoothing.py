@@ -108,11 +108,3 @@ def smooth_motion(
     if sigma is None:
         std *= np.sqrt(square / freedom) if freedom > 0 else np.nan
     return PathDerivatives(*out, *std)
-
-
-def noise_gain(settings: SmoothingSettings, fps: float) -> tuple[float, float]:
-    """Return how much of the positions' noise velocities (1/s) and accelerations (1/s²) have amid a gapless track."""
-    T = 2 * settings.half_width + 1
-    line = np.zeros((1, T, 3))
-    motion = smooth_motion(line, fps, np.ones((1, T)), settings)
-    return float(motion.velocity_std[0, T // 2]), float(motion.acceleration_std[0, T // 2])

@@ -10,12 +10,12 @@ from scipy.sparse import coo_matrix
 from scipy.spatial.transform import Rotation
 
 from geomocap.calibration.bundle_adjustment import AdjustedNetwork, adjust, image_residuals
-from geomocap.calibration.ceres import adjust_with_ceres
 from geomocap.calibration.network import Network
 from geomocap.calibration.projection import project_point
 from geomocap.errors import CalibrationError
 from tests.benchmarks.table import Row, measure
 from tests.geomocap.bar_scenes import disturbed_network, eight_cameras, three_cameras
+from tests.geomocap.ceres_adjustment import adjust_with_ceres
 
 
 def by_scipy(network: Network) -> tuple[float, float]:

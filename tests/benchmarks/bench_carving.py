@@ -8,13 +8,13 @@ import open3d as o3d
 from geomocap.carving.carving_settings import CarvingSettings, ConsistencySettings, HullSettings
 from geomocap.carving.frames import carve_frame
 from geomocap.carving.hull import hull, hull_surface, visual_hull
-from geomocap.carving.reference import visual_hull_brute, visual_hull_numpy
 from geomocap.carving.silhouette_views import PinholeViews
 from geomocap.carving.subject_bounds import subject_box
 from geomocap.carving.visibility import SurfaceVoxels, depth_buffers
 from geomocap.carving.voxel_grid import Grid
 from tests.benchmarks.table import Row, measure
 from tests.geomocap.carving_scenes import FIGURE, ring, silhouettes
+from tests.geomocap.hull_reference import visual_hull_brute, visual_hull_numpy
 
 GRID = Grid(np.array([-1.0, -1.0, -0.1]), 2 / 256, (256, 256, 256))
 

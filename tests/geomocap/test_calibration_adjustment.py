@@ -176,7 +176,7 @@ def test_same_bits_twice() -> None:
 
 def test_ceres_finds_the_same() -> None:
     pytest.importorskip("pyceres", reason="pyceres (extra `solver`) is not installed")
-    from geomocap.calibration.ceres import adjust_with_ceres
+    from tests.geomocap.ceres_adjustment import adjust_with_ceres
 
     network = disturbed_network(three_cameras(2, 30), 0.05, 1)
     ours, theirs = adjust(network, tolerance=1e-14).network, adjust_with_ceres(network, 1)

@@ -13,11 +13,11 @@ from geomocap.carving.block_kernels import summed
 from geomocap.carving.carving_settings import HullSettings
 from geomocap.carving.hull import hull_surface, visual_hull
 from geomocap.carving.occupancy import Occupancy
-from geomocap.carving.reference import visual_hull_brute, visual_hull_numpy
 from geomocap.carving.silhouette_views import PinholeViews
 from geomocap.carving.voxel_grid import Grid
 from geomocap.errors import GeometryError
 from tests.geomocap.carving_scenes import FIGURE, look_at, ring, silhouettes
+from tests.geomocap.hull_reference import visual_hull_brute, visual_hull_numpy
 
 
 def blobs(rng: np.random.Generator, height: int, width: int) -> np.ndarray:

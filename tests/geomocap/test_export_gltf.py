@@ -13,7 +13,7 @@ WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 class Glb:
-    """A reader that follows the glTF 2.0 specification and fractions nothing with the writer."""
+    """A reader that follows the glTF 2.0 specification and shares nothing with the writer."""
 
     def __init__(self, path):
         self.file = pygltflib.GLTF2.load(str(path))

@@ -35,7 +35,7 @@ def two_bodies(swing_deg: float, seed: int = 0):
 
 
 @pytest.mark.parametrize(("swing_deg", "hinge"), [(0.0, True), (6.0, False)])
-def test_a_joint_is_a_hinge_if_the_sightings_show_no_other_turns(swing_deg, hinge):
+def test_a_joint_is_a_hinge_if_the_observations_show_no_other_turns(swing_deg, hinge):
     moved, motion, linkage, points = two_bodies(swing_deg)
     seen = np.ones(moved.shape[:2], bool)
     information = turn_information(linkage, body_motion(linkage, motion), points, seen, np.full(180, NOISE**-2))

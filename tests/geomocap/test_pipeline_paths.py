@@ -101,7 +101,7 @@ def test_patches_that_are_not_there(job):
         motion_paths(job("patches"), Ball(), False)
 
 
-def test_lines_of_sight_go_with_the_paths_where_single_cameras_saw_them():
+def test_rays_go_with_the_paths_where_single_cameras_saw_them():
     tracks = trajectories(40, 1.0)
     tracked = {"positions": tracks, "sigma": np.full(tracks.shape[:2], 0.002), "ray": np.zeros(tracks.shape)}
     found = patch_paths(tracked)

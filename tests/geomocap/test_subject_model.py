@@ -25,7 +25,7 @@ def box_shell(low, high):
 
 
 @pytest.fixture(scope="module")
-def take():
+def sequence():
     """Chain of two boxes, its bodies and skeleton, and the geometry of its frames."""
     scene = chain(2, samples=120)
     bodies = find_motion_bodies(MotionPaths(scene.positions), MotionBodiesSettings(bodies=2))
@@ -44,13 +44,13 @@ def take():
 
 
 @pytest.fixture(scope="module")
-def model(take):
-    bodies, found, _, read = take
+def model(sequence):
+    bodies, found, _, read = sequence
     return build_model(found, bodies, np.array([True]), read, SPACING)
 
 
-def test_surface_is_the_boxes(model, take):
-    _, _, shell, _ = take
+def test_surface_is_the_boxes(model, sequence):
+    _, _, shell, _ = sequence
     distance = np.linalg.norm(model.points[:, None] - shell[None, ::7], axis=2).min(axis=1)
     assert distance.max() < 3 * SPACING
     inside = (model.points[:, 0] > 0.1) & (model.points[:, 0] < 0.3)
@@ -60,8 +60,8 @@ def test_surface_is_the_boxes(model, take):
     np.testing.assert_array_equal(model.colors[0], [255, 128, 0])
 
 
-def test_a_point_that_one_frame_invents_is_left_out(take):
-    bodies, found, _, read = take
+def test_a_point_that_one_frame_invents_is_left_out(sequence):
+    bodies, found, _, read = sequence
 
     def with_ghost(frame):
         cloud = read(frame)
@@ -150,8 +150,8 @@ def test_damaged_and_missing_files_give_one_clear_line(tmp_path):
         assert name in str(error.value) and "\n" not in str(error.value)
 
 
-def test_glb_shows_the_models_skin_with_its_weights(model, take, tmp_path):
-    _, found, _, _ = take
+def test_glb_shows_the_models_skin_with_its_weights(model, sequence, tmp_path):
+    _, found, _, _ = sequence
     run = Run(tmp_path)
     run.write_npz("model.npz", **model.arrays())
     run.write_npz("skeleton.npz", **found.skeleton.arrays())

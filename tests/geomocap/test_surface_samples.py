@@ -105,7 +105,7 @@ def test_what_is_unsure_along_the_ray_does_not_turn_a_body():
     assert errors[1] < 0.35 * errors[0]
 
 
-def test_a_motion_with_lines_of_sight_is_the_least_squares_one():
+def test_a_motion_with_rays_is_the_least_squares_one():
     rest, _, positions, ray = seen_by_single_cameras(0.02)
     weights = np.random.default_rng(9).random((60, 6)) + 0.5
     least = 1e3  # residuals of this scale are all the same: no robust weights
@@ -119,7 +119,7 @@ def test_a_motion_with_lines_of_sight_is_the_least_squares_one():
     np.testing.assert_allclose(found, least_squares(misses, np.zeros(6), xtol=1e-12).x, atol=1e-6)
 
 
-def test_blends_with_lines_of_sight_are_those_of_a_search():
+def test_blends_with_rays_are_those_of_a_search():
     rng = np.random.default_rng(10)
     rotations = Rotation.from_rotvec(rng.normal(scale=0.4, size=(10, 3))).as_matrix().reshape(2, 5, 3, 3)
     translations = rng.normal(scale=0.1, size=(2, 5, 3))

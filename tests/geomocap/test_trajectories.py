@@ -5,7 +5,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from geomocap.errors import GeometryError
 from geomocap.model.trajectories import TOO_FAST, UNLIKE, Trajectories
 from geomocap.trajectories.filters import FilterSettings, departure, filter_trajectories
-from geomocap.trajectories.smoothing import SmoothingSettings, noise_gain, smooth_motion
+from geomocap.trajectories.smoothing import SmoothingSettings, smooth_motion
 from tests.geomocap.made_trajectories import join_tracks, make_tracks, rigid_tracks
 
 FPS = 30.0
@@ -84,6 +84,14 @@ def test_standard_deviations_may_be_in_single_precision():
     one, other = smooth_motion(path, FPS, sigma), smooth_motion(path, FPS, sigma.astype(float))
     for name in one.__dataclass_fields__:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def noise_gain(settings: SmoothingSettings, fps: float) -> tuple[float, float]:
+    """Return how much of the positions' noise velocities (1/s) and accelerations (1/s²) have amid a gapless track."""
+    T = 2 * settings.half_width + 1
+    line = np.zeros((1, T, 3))
+    motion = smooth_motion(line, fps, np.ones((1, T)), settings)
+    return float(motion.velocity_std[0, T // 2]), float(motion.acceleration_std[0, T // 2])
 
 
 def test_noise_is_found_from_the_residuals_if_it_is_not_given():

@@ -79,7 +79,7 @@ def model():
     )
 
 
-def take_of(model, frames=12):
+def sequence_of(model, frames=12):
     """The subject elsewhere, turned by 100°, walking on while its arm rises and its head nods."""
     time = np.linspace(0, 1, frames)
     local = np.tile(np.eye(3), (frames, 3, 1, 1))
@@ -93,7 +93,7 @@ def take_of(model, frames=12):
 
 @pytest.fixture(scope="module")
 def tracked(model):
-    true, places = take_of(model)
+    true, places = sequence_of(model)
     rng = np.random.default_rng(0)
     shaken = places + rng.normal(0, 0.002, places.shape)
     found = follow_model(model, lambda t: (shaken[t], None), len(places), SPACING, 2)
@@ -122,7 +122,7 @@ def test_too_few_points_give_one_clear_line(model):
 
 
 def test_tracked_points_are_hung_on_the_model(model):
-    true, places = take_of(model)
+    true, places = sequence_of(model)
     some = np.arange(0, len(model.points), 25)
     seen = places[:, some].swapaxes(0, 1).copy()
     seen[::2, :6] = np.nan
@@ -140,14 +140,14 @@ def unsure(places):
 
 
 def test_depths_of_a_single_camera_do_not_draw_the_model_away(model):
-    true, places = take_of(model)
+    true, places = sequence_of(model)
     found = follow_model(model, lambda t: (places[t], None), len(places), SPACING, 2, unsure(places))
     apart = model.linkage.joint_positions(found.bodies) - model.linkage.joint_positions(true)
     assert np.linalg.norm(apart, axis=2).max() < 0.025  # of 0.11 if paths were as sure in depth
 
 
 def test_turns_are_seen_across_the_ray(model):
-    true, places = take_of(model)
+    true, places = sequence_of(model)
     paths = unsure(places)
     motion, bodies = rolled(model, true, 0.5 * np.sin(np.arange(len(places))))
     skin = attach_paths(model, true, paths, 0.2)
@@ -169,7 +169,7 @@ def rolled(model, true, about):
 
 
 def test_tracked_points_turn_the_bodies_where_the_surface_does_not(model):
-    true, places = take_of(model)
+    true, places = sequence_of(model)
     some = np.random.default_rng(3).permutation(len(model.points))[:700]
     seen = places[:, some].swapaxes(0, 1).copy()
     seen[::3, :5] = seen[1::3, 8:] = np.nan
@@ -183,7 +183,7 @@ def test_tracked_points_turn_the_bodies_where_the_surface_does_not(model):
 
 
 def test_tracked_points_follow_the_body_that_carries_them(model):
-    true, places = take_of(model)
+    true, places = sequence_of(model)
     arm = np.flatnonzero((model.skin.body == 1) & (model.points[:, 0] < 0.2))[::5]
     seen = places[:, arm].swapaxes(0, 1)
     # beside the shoulder, the trunk's points are as near, but only the arm's move along
@@ -191,7 +191,7 @@ def test_tracked_points_follow_the_body_that_carries_them(model):
 
 
 def test_pose_prior_holds_what_nothing_is_seen_of(model):
-    true, places = take_of(model, 4)
+    true, places = sequence_of(model, 4)
     linkage = model.linkage
     motion = JointMotion(np.tile(np.eye(3), (4, 3, 1, 1)), np.tile(linkage.origin, (4, 1)))
     trunk = np.flatnonzero(model.skin.body == 0)
@@ -218,7 +218,7 @@ def test_matches_are_the_nearest_points_of_the_same_side(model):
 
 
 def test_pose_is_looked_for_in_all_frames_and_given_where_it_fits_best(model):
-    true, places = take_of(model)
+    true, places = sequence_of(model)
     scales = MatchingScales(0.03, 0.0, 0.1, SPACING, 0.05, 0.05)
     ball = np.random.default_rng(1).normal(size=(2000, 3))
     ball *= 0.4 / np.linalg.norm(ball, axis=1, keepdims=True)
@@ -230,7 +230,7 @@ def test_pose_is_looked_for_in_all_frames_and_given_where_it_fits_best(model):
 
 
 def test_model_in_another_rest_pose_moves_alike(model):
-    true, places = take_of(model)
+    true, places = sequence_of(model)
     again = model.reposed(true, 5)
     np.testing.assert_allclose(again.points, places[5], atol=1e-12)
     carried = since(true, 5).carry(again.points, again.skin_bodies, again.skin_weights)
@@ -264,9 +264,9 @@ def test_limits_are_those_of_all_takes(model):
 
 
 def test_stage_follows_the_model_and_says_when_it_fits_poorly(model, tmp_path):
-    _, places = take_of(model, 3)
+    _, places = sequence_of(model, 3)
     Run(tmp_path / "first").write_npz("model.npz", **model.arrays())
-    settings = Config(take=FollowingSettings(rounds=1, steps=3, start_frames=1))
+    settings = Config(following=FollowingSettings(rounds=1, steps=3, start_frames=1))
     for name, scale in (("good", 1.0), ("large", 1.6)):
         np.savez(tmp_path / f"{name}.npz", points=scale * places)
         with threads(1) as executor:
