@@ -22,7 +22,7 @@ _ISOLATED = 0.5
 
 
 @dataclass(frozen=True)
-class _PointSet:
+class _Subset:
     """A part of the points of all frames, divided into ellipsoids by itself.
 
     `members` are the numbers of its points in each frame, T arrays (n_t,).
@@ -48,7 +48,7 @@ class _PointSet:
 class _FoundBody:
     """Ellipsoids of a set that are one body, and the one among them that it was found from."""
 
-    origin: _PointSet
+    origin: _Subset
     chosen: np.ndarray
     seed: int
 
@@ -88,7 +88,7 @@ def peel_bodies(
         Bodies in the order in which they were found.
     """
     found: list[_FoundBody] = []
-    queue = deque([_PointSet(paths, [np.arange(len(labels), dtype=np.int32) for labels in paths.labels])])
+    queue = deque([_Subset(paths, [np.arange(len(labels), dtype=np.int32) for labels in paths.labels])])
     while queue:
         some = queue.popleft()
         first = some.paths.ellipsoids
@@ -111,14 +111,14 @@ def peel_bodies(
 
 def _segmented_again(
     run: Callable[[Points], EllipsoidPaths], points: Points, members: list[np.ndarray]
-) -> _PointSet | None:
+) -> _Subset | None:
     try:
-        return _PointSet(run(partial(_subset, points, members)), members)
+        return _Subset(run(partial(_points_of, points, members)), members)
     except GeometryError:  # too few points in some frame for the ellipsoids of the first
         return None
 
 
-def _subset(points: Points, members: list[np.ndarray], frame: int) -> np.ndarray:
+def _points_of(points: Points, members: list[np.ndarray], frame: int) -> np.ndarray:
     return points(frame)[members[frame]]
 
 
