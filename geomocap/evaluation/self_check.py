@@ -95,11 +95,10 @@ def check_result(
         seen = views(frame)
         placed = motion.part(slice(frame, frame + 1)).carry(mesh.skin.rest, mesh.skin.bodies, mesh.skin.fractions)[0]
         scene = o3d.t.geometry.RaycastingScene()
-        scene.add_triangles(
-            o3d.core.Tensor.from_numpy(placed.astype(np.float32)),
-            o3d.core.Tensor.from_numpy(mesh.surface.triangles.astype(np.uint32)),
-        )
-        model[:, column] = [_drawn_overlap(scene, rig, seen, c) for c in range(len(cameras))]
+        corners, triangles = placed.astype(np.float32), mesh.surface.triangles.astype(np.uint32)
+        scene.add_triangles(o3d.core.Tensor.from_numpy(corners), o3d.core.Tensor.from_numpy(triangles))
+        for c in np.flatnonzero(~seen.blind()):
+            model[c, column] = _drawn_overlap(scene, rig, seen, int(c))
         left_out[:, column] = _left_out_overlaps(seen, placed)
     return SelfCheck(tuple(cameras), np.asarray(frames), model, left_out, float(residual))
 
