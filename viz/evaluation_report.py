@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from geomocap.evaluation import Curve, Evaluation
 from geomocap.evaluation.body_scores import LabelledFrame, labelled_frame
 from geomocap.evaluation.truth import Truth
+from geomocap.files.frame_files import read_points
 from geomocap.files.run import Run
 from geomocap.progress import Progress, silent
 from viz.body_colors import ACCENT, body_color, hex_color
@@ -19,7 +20,6 @@ from viz.figures import MUTED, plot
 from viz.matching_review import error_sheet, surface_errors
 from viz.report import Block, Report, Section, missing, picture, table, text, write_report
 from viz.report import plot as plot_block
-from viz.results import read_points
 
 WORST_CURVES = 8
 KEY_FIGURES = (

@@ -216,8 +216,8 @@ def assess(results: Results, frames: list[int]) -> Quality:
     shaking = jitter(skeleton) if skeleton is not None else None
     unassigned = None
     if "bodies" in results.kinds:
-        labels = [results.bodies(f).bodies for f in frames if results.has("bodies", f)]
-        unassigned = float(np.mean(np.concatenate([np.asarray(b) for b in labels]) < 0)) if labels else None
+        labels = [results.bodies(f).body for f in frames if results.has("bodies", f)]
+        unassigned = float(np.mean(np.concatenate(labels) < 0)) if labels else None
     quality = Quality(cover, agree, bone_list, shaking, unassigned)
     return Quality(cover, agree, bone_list, shaking, unassigned, [*results.remarks, *warnings(results, quality)])
 

@@ -5,70 +5,18 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import open3d as o3d
 
-from geomocap.errors import GeometryError, RunError
+from geomocap.errors import RunError
 from geomocap.files.capture import Capture
+from geomocap.files.frame_files import ply_count, read_points, read_voxels
 from geomocap.files.images import read_image
-from geomocap.files.open3d_geometry import read_by_open3d
 from geomocap.files.run import Run
-from geomocap.model.frame_geometry import Voxels
+from geomocap.model.frame_geometry import BodyPoints, Voxels
 
 KINDS = ("bodies", "voxels", "cloud")
-
-
-@dataclass(frozen=True)
-class Points:
-    """Coloured points of one frame.
-
-    Attributes
-    ----------
-    positions : (N, 3) float, metres, world
-    colors : (N, 3) uint8, RGB
-    normals : (N, 3) float or None
-    bodies : (N,) int or None
-        Body of each point, -1 for none.
-    """
-
-    positions: np.ndarray
-    colors: np.ndarray
-    normals: np.ndarray | None = None
-    bodies: np.ndarray | None = None
-
-
-def read_points(path: Path) -> Points:
-    """Read a point cloud's PLY with its colours, normals and `body` attribute, as far as they are there.
-
-    Raises
-    ------
-    GeometryError
-        If the file holds no points.
-    """
-    cloud = read_by_open3d(o3d.t.io.read_point_cloud, path)
-    if cloud.is_empty():
-        raise GeometryError(f"{path}: no readable point cloud; delete it and run again")
-    positions = cloud.point.positions.numpy().astype(np.float64)
-    keep = np.isfinite(positions).all(axis=1)
-    colors = np.full((len(positions), 3), 150, np.uint8)
-    if "colors" in cloud.point:
-        raw = cloud.point["colors"].numpy()
-        colors = raw if raw.dtype == np.uint8 else np.clip(np.rint(raw * 255), 0, 255).astype(np.uint8)
-    normals = cloud.point["normals"].numpy()[keep] if "normals" in cloud.point else None
-    bodies = cloud.point["body"].numpy().ravel().astype(int)[keep] if "body" in cloud.point else None
-    return Points(positions[keep], colors[keep], normals, bodies)
-
-
-def ply_count(path: Path) -> int:
-    """Return the number of vertices that a PLY file announces, without reading them; 0 if it announces none."""
-    with path.open("rb") as file:
-        for line in file.read(4096).splitlines():
-            if line.startswith(b"element vertex"):
-                return int(line.split()[2])
-    return 0
 
 
 @dataclass(frozen=True)
@@ -205,18 +153,15 @@ class Results:
 
     def voxels(self, frame: int) -> Voxels:
         """Read the voxels of a frame."""
-        return Voxels.read(self.run.frame_file("voxels", frame))
+        return read_voxels(self.run.frame_file("voxels", frame))
 
-    def cloud(self, frame: int) -> Points:
+    def cloud(self, frame: int) -> BodyPoints:
         """Read the cloud of a frame."""
-        return read_points(self.run.frame_file("cloud", frame))
+        return read_points(self.run.frame_file("cloud", frame)).finite
 
-    def bodies(self, frame: int) -> Points:
+    def bodies(self, frame: int) -> BodyPoints:
         """Read the bodies of a frame; points without a `body` attribute count as unassigned."""
-        points = read_points(self.run.frame_file("bodies", frame))
-        if points.bodies is None:
-            return Points(points.positions, points.colors, points.normals, np.full(len(points.positions), -1))
-        return points
+        return read_points(self.run.frame_file("bodies", frame)).finite
 
     def any_points(self, frame: int) -> np.ndarray:
         """Points of a frame from whatever is there: (N, 3) float, metres; empty if nothing is."""

@@ -87,7 +87,7 @@ def cameras_table(results: Results) -> Block:
 
 def bodies_table(results: Results, frame: int) -> Block:
     """Return the table of bodies: their fraction of the points, ellipsoids and joints."""
-    labels = np.asarray(results.bodies(frame).bodies)
+    labels = results.bodies(frame).body
     e, s = results.ellipsoids, results.skeleton
     count = int(max(labels.max(initial=-1), -1 if e is None else e.body.max(initial=-1))) + 1
     rows, colors = [], []

@@ -9,15 +9,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numba
-import open3d as o3d
 
 from geomocap.dense import CloudFrame, CloudSettings, MatchGroups, cloud_of_frame, match_groups
 from geomocap.errors import CaptureError, GeometryError, RunError
-from geomocap.files.atomic import write_atomic, write_text
+from geomocap.files.atomic import write_text
 from geomocap.files.capture import Capture
+from geomocap.files.frame_files import read_voxels, write_points
 from geomocap.files.images import read_image
 from geomocap.files.run import Run, stage_key
-from geomocap.model.frame_geometry import Voxels
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.silhouette_stage import silhouettes
 from geomocap.pipeline.voxel_stage import voxels
@@ -97,8 +96,7 @@ class _Measure:
         if not len(found.points):
             why = "; ".join(found.warnings) or ", ".join(f"{reason}: {n}" for reason, n in found.reasons.items())
             raise GeometryError(f"frame {frame}: no surface point could be matched ({why}); is there texture in focus?")
-        cloud = found.cloud
-        write_atomic(self.run.frame_file("cloud", frame), lambda p: o3d.t.io.write_point_cloud(p, cloud))
+        write_points(self.run.frame_file("cloud", frame), found.cloud)
 
     def measure(self, frame: int) -> CloudFrame:
         """Measure one frame without writing anything."""
@@ -108,7 +106,7 @@ class _Measure:
         if self.bounds != "none":
             masks = [read_image(self.run.silhouette_file(c, frame), gray=True) for c in cameras]
         if self.bounds == "hull":
-            hull = Voxels.read(self.run.frame_file("voxels", frame))
+            hull = read_voxels(self.run.frame_file("voxels", frame))
         box = self.capture.info.region_of_interest
         return cloud_of_frame(images, masks, hull, self.capture.rig, self.groups, self.settings, box)
 

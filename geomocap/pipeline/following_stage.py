@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geomocap.files.atomic import fingerprint
+from geomocap.files.frame_files import write_points
 from geomocap.files.run import Run, stage_key
 from geomocap.model.ellipsoids import Ellipsoids, fit_ellipsoids
 from geomocap.model.frame_geometry import BodyPoints, Geometry
@@ -128,5 +129,5 @@ class _Label:
         skin = self.model.skin
         placed = self.bodies.part(slice(frame, frame + 1)).carry(skin.rest, skin.bodies, skin.fractions)[0]
         label = skin.body[cKDTree(placed).query(points)[1]].astype(np.int32)
-        BodyPoints(points, label).write(self.run.frame_file("bodies", frame))
+        write_points(self.run.frame_file("bodies", frame), BodyPoints(points, label))
         return fit_ellipsoids(points, label, self.model.body_count, self.geometry.spacing)

@@ -9,6 +9,7 @@ import numpy as np
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.bodies.point_labels import label_points
 from geomocap.bodies.ray_depths import find_bodies_and_depths
+from geomocap.files.frame_files import write_points
 from geomocap.files.run import Run
 from geomocap.model.ellipsoids import Ellipsoids, fit_ellipsoids
 from geomocap.model.frame_geometry import BodyPoints, Geometry
@@ -91,5 +92,5 @@ class _Label:
     def __call__(self, frame: int) -> Ellipsoids:
         points = self.geometry.points(frame)
         label = label_points(self.bodies, self.paths, frame, points)
-        BodyPoints(points, label).write(self.run.frame_file("bodies", frame))
+        write_points(self.run.frame_file("bodies", frame), BodyPoints(points, label))
         return fit_ellipsoids(points, label, self.bodies.body_count, self.geometry.spacing)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from geomocap.errors import SettingsError
+from geomocap.files.frame_files import write_points
 from geomocap.files.run import Run, stage_key
 from geomocap.model.frame_geometry import BodyPoints, Geometry
 from geomocap.pipeline.cloud_stage import bounds_of
@@ -92,4 +93,4 @@ class _WriteBodies:
 
     def __call__(self, frame: int) -> None:
         points = BodyPoints(self.geometry.points(frame), self.found.body_labels(frame))
-        points.write(self.run.frame_file("bodies", frame))
+        write_points(self.run.frame_file("bodies", frame), points)

@@ -6,7 +6,8 @@ import numpy as np
 
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.errors import GeometryError
-from geomocap.model.frame_geometry import BodyPoints, Geometry
+from geomocap.files.frame_files import read_points
+from geomocap.model.frame_geometry import Geometry
 from geomocap.pipeline.job import Job
 from geomocap.skeleton.motion_skeleton import MotionSkeleton
 from geomocap.subject.model_building import BodyCloud, build_model
@@ -17,7 +18,7 @@ def make_model(job: Job, geometry: Geometry, found: MotionSkeleton, bodies: Moti
     """Make and write the model of a run whose points have their bodies; return in words why, if it can't be made."""
 
     def read(frame: int) -> BodyCloud:
-        labelled = BodyPoints.read(job.run.frame_file("bodies", frame))
+        labelled = read_points(job.run.frame_file("bodies", frame))
         colors = geometry.features(frame) if geometry.features is not None else None
         return BodyCloud(labelled.positions, labelled.body, colors)
 

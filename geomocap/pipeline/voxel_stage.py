@@ -15,6 +15,7 @@ from geomocap.carving.volume import working_volume
 from geomocap.carving.voxel_grid import Grid
 from geomocap.errors import CaptureError
 from geomocap.files.capture import Capture
+from geomocap.files.frame_files import write_voxels
 from geomocap.files.images import read_image
 from geomocap.files.run import Run, stage_key
 from geomocap.pipeline.job import Job
@@ -92,4 +93,4 @@ class _Carve:
         if needs_images(self.settings):
             images = self.undistortion.images([self.capture.frame(c, frame) for c in self.capture.cameras])
         found = carve_frame(self.checked_views(frame), self.grid, self.settings, images, frame)
-        found.write(self.run.frame_file("voxels", frame))
+        write_voxels(self.run.frame_file("voxels", frame), found)
