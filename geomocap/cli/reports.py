@@ -9,8 +9,8 @@ from rich.console import Console
 from geomocap.errors import GeomocapError
 from geomocap.files.atomic import fingerprint
 from geomocap.files.capture import Capture
+from geomocap.files.results import read_cloud_record
 from geomocap.files.run import Run, stage_key
-from geomocap.pipeline.cloud_stage import read_cloud_record
 from geomocap.pipeline.job import Job
 from viz.review import review
 

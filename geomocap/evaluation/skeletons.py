@@ -8,7 +8,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from geomocap.evaluation.result import Curve, Evaluation, Match
-from geomocap.evaluation.truth import Truth, angles_deg
+from geomocap.evaluation.truth import Truth
+from geomocap.model.rotations import relative_turns, turn_angles
 
 FOUND_WITHIN, WELL_WITHIN, CAP = 0.10, 0.05, 0.15  # fractions of the height
 LOST = 10.0  # heights: what a joint without a position counts as
@@ -114,7 +115,7 @@ def _judge_rotations(rotations: np.ndarray, truth: Truth, votes: np.ndarray) -> 
             continue
         root = int(truth.bodies.root[b])
         true = _since_first(truth.joint_rotations[:T, root])
-        error = angles_deg(np.einsum("tji,tjk->tik", true, _since_first(rotations[:, k])))
+        error = np.rad2deg(turn_angles(relative_turns(true, _since_first(rotations[:, k]))))
         errors.append(error.mean())
         curves.append(Curve(f"body {truth.joint_names[root]}: rotation error", "°", np.arange(T), error))
     if not errors:

@@ -16,9 +16,9 @@ import numpy as np
 from geomocap.export.body_tree import BodyTree, body_tree
 from geomocap.export.conventions import Axis
 from geomocap.export.export_errors import MotionError
-from geomocap.export.file_rotations import fill_positions, fill_rotations
 from geomocap.export.motion_tree import MotionTree
 from geomocap.export.names import Names
+from geomocap.model.rotations import fill_rotations
 
 JointMode = Literal["auto", "fixed", "moving"]
 FIXED_WITHIN = 1e-5  # m: a joint that stays this near its mean place in the parent body is fixed; ten add up to 0.1 mm
@@ -243,3 +243,21 @@ class _Chain:
         centers = [fill_positions(p)[0] for p in self.body_positions.swapaxes(0, 1)]
         places = [node.world_origin[0] for node in self.nodes if node.body >= 0 or node.joint >= 0]
         return float(np.linalg.norm(np.ptp([*centers, *places], axis=0)))
+
+
+def fill_positions(positions: np.ndarray) -> np.ndarray:
+    """Fill frames without a position (NaN) linearly between their neighbours; ends are held.
+
+    Parameters
+    ----------
+    positions : (T, 3) float
+        If no frame has a position, the result is zero.
+    """
+    good = np.isfinite(positions).all(axis=1)
+    if good.all():
+        return np.asarray(positions, float)
+    frames = np.flatnonzero(good)
+    if len(frames) == 0:
+        return np.zeros(positions.shape)
+    every = np.arange(len(positions))
+    return np.stack([np.interp(every, frames, positions[frames, i]) for i in range(3)], axis=1)

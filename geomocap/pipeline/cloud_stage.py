@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import re
-from collections import Counter
 from dataclasses import dataclass
 from typing import Literal
 
 import numba
 
 from geomocap.dense import CloudFrame, CloudSettings, MatchGroups, cloud_of_frame, match_groups
-from geomocap.errors import CaptureError, GeometryError, RunError
-from geomocap.files.atomic import write_text
+from geomocap.errors import CaptureError, GeometryError
 from geomocap.files.capture import Capture
-from geomocap.files.frame_files import read_voxels, write_points
-from geomocap.files.images import read_image
+from geomocap.files.results import read_silhouette, read_voxels, write_cloud_record, write_points
 from geomocap.files.run import Run, stage_key
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.silhouette_stage import silhouettes
@@ -91,8 +86,7 @@ class _Measure:
             found = self.measure(frame)
         finally:
             numba.set_num_threads(before)
-        record = {"points": len(found.points), "reasons": found.reasons, "warnings": found.warnings}
-        write_text(self.run.path / "cloud" / f"{frame:06d}.json", json.dumps(record, indent=1))
+        write_cloud_record(self.run, frame, len(found.points), found.reasons, found.warnings)
         if not len(found.points):
             why = "; ".join(found.warnings) or ", ".join(f"{reason}: {n}" for reason, n in found.reasons.items())
             raise GeometryError(f"frame {frame}: no surface point could be matched ({why}); is there texture in focus?")
@@ -104,56 +98,11 @@ class _Measure:
         images = [self.capture.frame(c, frame) for c in cameras]
         masks = hull = None
         if self.bounds != "none":
-            masks = [read_image(self.run.silhouette_file(c, frame), gray=True) for c in cameras]
+            masks = [read_silhouette(self.run, c, frame) for c in cameras]
         if self.bounds == "hull":
             hull = read_voxels(self.run.frame_file("voxels", frame))
         box = self.capture.info.region_of_interest
         return cloud_of_frame(images, masks, hull, self.capture.rig, self.groups, self.settings, box)
-
-
-@dataclass(frozen=True)
-class CloudRecord:
-    """What a run says of its clouds.
-
-    Attributes
-    ----------
-    frames : int
-    points : int
-        Of all frames.
-    reasons : dict
-        What became of all cells and seeds, in words, summed over the frames.
-    warnings : dict
-        Warnings, and the number of frames that have them or the same with other figures.
-    """
-
-    frames: int
-    points: int
-    reasons: dict[str, int]
-    warnings: dict[str, int]
-
-
-def read_cloud_record(run: Run) -> CloudRecord | None:
-    """Sum up `cloud/*.json` of a run; None if there are none.
-
-    Raises
-    ------
-    RunError
-        If a file is damaged.
-    """
-    reasons, warnings = Counter[str](), Counter[str]()
-    first: dict[str, str] = {}
-    files = sorted((run.path / "cloud").glob("[0-9]*.json"))
-    points = 0
-    for file in files:
-        try:
-            record = json.loads(file.read_text(encoding="utf-8"))
-            points += int(record["points"])
-            reasons.update({str(k): int(v) for k, v in record["reasons"].items()})
-            for warning in record["warnings"]:
-                warnings[first.setdefault(re.sub(r"[\d.]+ ?(px|%)", "", warning), warning)] += 1
-        except (OSError, ValueError, KeyError, AttributeError, TypeError):
-            raise RunError(f"{file}: damaged; delete it and run again") from None
-    return CloudRecord(len(files), points, dict(reasons), dict(warnings)) if files else None
 
 
 def measure_again(run: Run, capture: Capture, settings: CloudSettings, frame: int) -> tuple[CloudFrame, MatchGroups]:

@@ -9,15 +9,15 @@ import numpy as np
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.bodies.point_labels import label_points
 from geomocap.bodies.ray_depths import find_bodies_and_depths
-from geomocap.files.frame_files import write_points
+from geomocap.files.results import write_diagnostics, write_ellipsoids, write_points, write_skeleton, write_warnings
 from geomocap.files.run import Run
+from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.ellipsoids import Ellipsoids, fit_ellipsoids
 from geomocap.model.frame_geometry import BodyPoints, Geometry
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.path_choice import motion_paths
 from geomocap.pipeline.subject_stage import make_model
-from geomocap.pipeline.warnings import write_warnings
 from geomocap.scheduling import map_items
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
 from geomocap.skeleton.refinement import refine_skeleton
@@ -53,18 +53,13 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
         count["items"] = frames
     label = _Label(geometry, job.run, bodies, paths)
     fitted = list(map_items(label, range(frames), job.executor, "labels", job.progress))
-    together = {
-        name: np.stack([getattr(e, name) for e in fitted])
-        for name in ("centers", "radii", "rotations", "counts", "errors")
-    }
-    job.run.write_npz("ellipsoids.npz", **together, body=np.arange(bodies.body_count, dtype=np.int32))
-    job.run.write_npz("skeleton.npz", **found.skeleton.arrays())
+    write_ellipsoids(job.run, Ellipsoids.stack(fitted, np.arange(bodies.body_count, dtype=np.int32)))
+    write_skeleton(job.run, found.skeleton)
     warnings = [*unsure_turns(bodies), *make_model(job, geometry, found, bodies)]
     if warnings:
         write_warnings(job.run, warnings)
-    job.run.write_npz(
-        "diagnostics.npz",
-        paths=np.array(source),
+    made = Diagnostics(
+        paths=source,
         sample_positions=bodies.positions,
         sample_body=bodies.label,
         sample_residuals=bodies.residuals,
@@ -77,6 +72,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
         curve_strengths=np.array([step.strength for step in bodies.curve]),
         alternative_labels=bodies.alternatives(),
     )
+    write_diagnostics(job.run, made)
     return frames
 
 

@@ -11,7 +11,7 @@ from geomocap.model.frame_geometry import Geometry
 from geomocap.pipeline.job import Job
 from geomocap.skeleton.motion_skeleton import MotionSkeleton
 from geomocap.subject.model_building import BodyCloud, build_model
-from geomocap.subject.subject_model import MODEL_FILE
+from geomocap.subject.subject_model import MODEL_FILE, write_model
 
 
 def make_model(job: Job, geometry: Geometry, found: MotionSkeleton, bodies: MotionBodies) -> list[str]:
@@ -29,5 +29,5 @@ def make_model(job: Job, geometry: Geometry, found: MotionSkeleton, bodies: Moti
             count["items"] = len(model.points)
     except GeometryError as error:
         return [str(error)]
-    job.run.write_npz(MODEL_FILE, **model.arrays())
+    write_model(job.run.path / MODEL_FILE, model)
     return []

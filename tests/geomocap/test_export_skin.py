@@ -5,10 +5,10 @@ from scipy.spatial import cKDTree
 
 from geomocap.export.export_errors import MotionError
 from geomocap.export.export_settings import ExportSettings
-from geomocap.export.file_rotations import rotation_about
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.skin import majority, node_of_body, skin_from_run, skin_weights
 from geomocap.files.run import Run
+from geomocap.model.rotations import rotation_about
 from geomocap.model.surface import Surface, point_spacing, shell_normals, surface_through
 
 VOXEL = 0.02
