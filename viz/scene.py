@@ -85,7 +85,7 @@ def ellipsoids(results: Results, frame: int) -> Mesh:
     return join(
         [
             ellipsoid(
-                e.centers[place, k], e.radii[place, k], e.rotations[place, k], palette.body_color(e.body[k]), level=4
+                e.centers[place, k], e.radii[place, k], e.rotations[place, k], palette.body_color(e.bodies[k]), level=4
             )
             for k in np.flatnonzero(whole)
         ]
@@ -116,7 +116,7 @@ def skeleton(results: Results, frame: int, size: float, outline_points: bool = T
     for body, joint, child in s.bones:
         meshes.append(_bone(s.place(place, body, joint), s.joint_positions[place, child], thick, body))
     for body in s.leaves:
-        joint = int(s.parent_joint[body])
+        joint = int(s.hierarchy.body_joints[body])
         if joint < 0:
             continue
         start, end = s.joint_positions[place, joint], s.body_positions[place, body]
@@ -149,7 +149,7 @@ def paths(results: Results, size: float, first: int = 0, last: int | None = None
     """Return the paths of the ellipsoids' centres (else of the joints) over places first … last of the sequence."""
     e, s = results.ellipsoids, results.skeleton
     if e is not None:
-        positions, owners = e.centers, e.body
+        positions, owners = e.centers, e.bodies
     elif s is not None:
         positions, owners = s.joint_positions, s.joint_bodies[:, 1]
     else:

@@ -10,6 +10,7 @@ import numpy as np
 import open3d as o3d
 
 from geomocap.evaluation.result import EvaluationError
+from geomocap.files.npz import read_npz
 from geomocap.model.rotations import relative_turns, turn_angles
 
 ACTIVE_DEG = 15.0  # a rig joint is active when its segment turns at least this much against its parent segment
@@ -93,13 +94,9 @@ class Truth:
             If the file is missing, damaged, lacks arrays, or holds NaN, no frames or lengths that are no metres.
         """
         file = path / "truth.npz" if path.is_dir() else path
-        try:
-            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
-                arrays = dict(data)
-        except FileNotFoundError:
-            raise EvaluationError(f"{file}: missing; a truth is a folder with truth.npz, or a motion file") from None
-        except Exception as error:
-            raise EvaluationError(f"{file}: damaged ({error}); make it again") from None
+        if not file.is_file():
+            raise EvaluationError(f"{file}: missing; a truth is a folder with truth.npz, or a motion file")
+        arrays = read_npz(file)
         _check(arrays, file)
         weights = arrays.get("vertex_weights")
         return cls(

@@ -131,7 +131,7 @@ def read_skeleton(run: Run) -> Skeleton:
     found = read_npz(file, needed=needed)
     with _named(file):
         pairs = found["joint_bodies"].astype(np.int32).reshape(-1, 2)
-        joints, places = len(pairs), found["joint_positions"]
+        joints, places = len(pairs), found["joint_positions"].astype(float)
         if not joints:
             places = np.zeros((len(found["body_positions"]), 0, 3))
         if places.ndim != 3 or places.shape[1] != joints or found["body_positions"].ndim != 3:
@@ -145,8 +145,8 @@ def read_skeleton(run: Run) -> Skeleton:
             pairs,
             found["joint_names"][order] if "joint_names" in found else joint_names(pairs, names),
             names,
-            found["body_rotations"],
-            found["body_positions"],
+            found["body_rotations"].astype(float),
+            found["body_positions"].astype(float),
             root,
             found["offsets"][order] if "offsets" in found else np.full((joints, 3), np.nan),
             found.get("body_offsets", np.full((count, 3), np.nan)),

@@ -129,6 +129,10 @@ class Run:
             return False
         return all((self.path / name).exists() for name in state["outputs"])
 
+    def unfinished(self) -> list[str]:
+        """Stages that were begun and aren't complete."""
+        return [f.stem for f in sorted((self.path / ".stages").glob("*.json")) if not self._state(f.stem).get("done")]
+
     def _state(self, stage: str) -> dict[str, Any]:
         try:
             return json.loads((self.path / ".stages" / f"{stage}.json").read_text())

@@ -24,7 +24,7 @@ def write_tracks(run: Run, tracks: Tracks) -> None:
     followed = tracks.trajectories
     arrays: dict[str, Any] = {"positions": followed.positions, "start": followed.start, "end": followed.end}
     arrays |= {name: getattr(followed, name) for name in _OF_TRAJECTORIES}
-    arrays |= {name: getattr(tracks.motion, name, None) for name in _OF_MOTION}
+    arrays |= {name: getattr(tracks.motion, name) for name in _OF_MOTION}
     arrays |= {"ray": followed.ray.astype(np.float32), "reasons": list(REASONS)}
     arrays |= {"unfiltered": tracks.unfiltered, "kept": tracks.kept}
     write_npz(run.path / TRACKS, {name: value for name, value in arrays.items() if value is not None})
@@ -47,24 +47,22 @@ def read_tracks(run: Run) -> Tracks:
     Raises
     ------
     RunError
-        If the file is missing, damaged or has no positions.
+        If the file is missing, damaged or has no positions or velocities.
     """
-    found = _arrays(run, (*_OF_TRAJECTORIES, *_OF_MOTION, "unfiltered", "kept"))
+    found = _arrays(run, (*_OF_TRAJECTORIES, *_OF_MOTION, "unfiltered", "kept"), ("positions", "velocities"))
     trajectories = _trajectories(run, found)
-    motion = None
-    if "velocities" in found:
-        nothing = np.broadcast_to(np.nan, found["velocities"].shape)
-        defaults = (nothing, nothing, nothing[..., 0], nothing[..., 0])
-        motion = PathDerivatives(*(found.get(n, d) for n, d in zip(_OF_MOTION, defaults, strict=True)))
+    unknown = np.broadcast_to(np.nan, trajectories.positions.shape)
+    defaults = (unknown, unknown, unknown[..., 0], unknown[..., 0])
+    motion = PathDerivatives(*(found.get(n, d) for n, d in zip(_OF_MOTION, defaults, strict=True)))
     try:
         return Tracks(trajectories, motion, found.get("unfiltered"), found.get("kept"))
     except GeometryError as error:
         raise _useless(run, error) from None
 
 
-def _arrays(run: Run, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+def _arrays(run: Run, names: tuple[str, ...], needed: tuple[str, ...] = ("positions",)) -> dict[str, np.ndarray]:
     """Arrays of those names with the positions, (N, T, …) whatever the layout."""
-    found = read_npz(run.path / TRACKS, ("positions", *_LAYOUT, *names), ("positions",))
+    found = read_npz(run.path / TRACKS, ("positions", *_LAYOUT, *names), needed)
     if str(found.get("layout", "")) == "ragged":
         try:
             found |= _dense(found)

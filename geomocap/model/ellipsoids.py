@@ -58,6 +58,11 @@ class Ellipsoids:
         return self.counts.shape[-1]
 
     @property
+    def frame_count(self) -> int:
+        """Number of frames T of a sequence."""
+        return len(self.counts)
+
+    @property
     def bodies(self) -> np.ndarray:
         """Body of each ellipsoid, (K,) int; -1: none."""
         return np.full(len(self), -1) if self.body is None else self.body

@@ -103,10 +103,10 @@ def parents_first(joint_bodies: np.ndarray, count: int) -> tuple[int, np.ndarray
     roots = np.setdiff1d(np.arange(count), pairs[:, 1])
     placed, order = roots[:1].tolist(), list[int]()
     for body in placed:
-        own = np.flatnonzero(pairs[:, 0] == body).tolist()
+        own = [j for j in np.flatnonzero(pairs[:, 0] == body).tolist() if pairs[j, 1] not in placed]
         order += own
         placed += pairs[own, 1].tolist()
-    if len(roots) != 1 or sorted(placed) != list(range(count)):
+    if len(pairs) != count - 1 or sorted(placed) != list(range(count)):
         raise GeometryError(
             f"{len(pairs)} joints between {count} bodies make no tree: each body but one hangs on one parent"
         )

@@ -177,7 +177,7 @@ class Tracks:
     ----------
     trajectories : Trajectories
         (N, T, …), those that the filters left.
-    motion : PathDerivatives, optional
+    motion : PathDerivatives
         Of the same points.
     unfiltered : (M, T, 3) float, metres, optional
         All trajectories before the filters.
@@ -186,13 +186,13 @@ class Tracks:
     """
 
     trajectories: Trajectories
-    motion: PathDerivatives | None = None
+    motion: PathDerivatives
     unfiltered: np.ndarray | None = None
     kept: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         shape = self.trajectories.positions.shape
-        if self.motion is not None and self.motion.velocities.shape != shape:
+        if self.motion.velocities.shape != shape:
             raise GeometryError(f"tracks: velocities have shape {self.motion.velocities.shape}, expected {shape}")
         if (self.unfiltered is None) != (self.kept is None):
             raise GeometryError("tracks: unfiltered trajectories go with the rows of those kept")

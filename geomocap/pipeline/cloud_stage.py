@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numba
+import numpy as np
 
-from geomocap.dense import CloudFrame, CloudSettings, MatchGroups, cloud_of_frame, match_groups
-from geomocap.errors import CaptureError, GeometryError
+from geomocap.config import load_config
+from geomocap.dense import CloudFrame, CloudSettings, MatchGroups, cloud_of_frame, match_groups, undistorted_color
+from geomocap.errors import CaptureError, GeometryError, GeomocapError
 from geomocap.files.capture import Capture
 from geomocap.files.results import read_silhouette, read_voxels, write_cloud_record, write_points
 from geomocap.files.run import Run, stage_key
@@ -105,12 +107,26 @@ class _Measure:
         return cloud_of_frame(images, masks, hull, self.capture.rig, self.groups, self.settings, box)
 
 
-def measure_again(run: Run, capture: Capture, settings: CloudSettings, frame: int) -> tuple[CloudFrame, MatchGroups]:
+def measure_again(run: Run, capture: Capture | None, frame: int) -> tuple[CloudFrame, np.ndarray] | None:
     """Measure one frame of a run once more, for what its files don't hold: regions, shifts, seeds.
 
     The settings are those of the run; silhouettes and hull are taken from it.
+
+    Returns
+    -------
+    (CloudFrame, (H, W, 3) uint8) or None
+        With the image of the template that gave most points, free of distortion; None if the capture is not at hand
+        or nothing is found.
     """
-    settings = cloud_settings(settings, capture)
+    if capture is None or not capture.is_calibrated:
+        return None
+    settings = cloud_settings(load_config(run.path / "run.toml").cloud, capture)
     groups = match_groups(capture.rig, settings.groups, capture.info.region_of_interest)
-    bounds = bounds_of(capture, settings)
-    return _Measure(capture, run, settings, groups, bounds).measure(frame), groups
+    try:
+        found = _Measure(capture, run, settings, groups, bounds_of(capture, settings)).measure(frame)
+    except GeomocapError:
+        return None
+    if not len(found.points):
+        return None
+    template = max(found.templates, key=lambda t: len(t.points)).group.template
+    return found, undistorted_color(capture.frame(capture.cameras[template], frame), groups, template)
