@@ -85,7 +85,7 @@ def check_silhouettes(
         remedy = f"set carving.hull.outside = 'auto', name only the other cameras in capture.toml, or {remedy}"
     raise GeometryError(
         f"frame {frame}: the silhouette of camera {', '.join(empty)} is empty, or nearly so; check {cause}; where the "
-        f"subject is out of ray, {remedy}"
+        f"subject is out of view, {remedy}"
     )
 
 

@@ -145,7 +145,7 @@ def possible_connections(bodies: MotionBodies, settings: MotionSkeletonSettings)
         certainty = (settings.interface_prior, border.spread, noise, settings.hinge_fraction)
         joint = common_point(*motions, reliability, interface, *certainty)
         if joint.hinge:
-            # every point of its axis is common: the joint is in the middle of what the bodies fraction of it
+            # every point of its axis is common: the joint is in the middle of what the bodies share of it
             interface = border.middle_along(joint.point, joint.axis)
             joint = common_point(*motions, reliability, interface, *certainty)
         off = float(np.linalg.norm(joint.point - interface))

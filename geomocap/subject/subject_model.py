@@ -32,7 +32,7 @@ class SubjectModel:
     colors : (P, 3) uint8 or (0, 3)
         RGB; none if the geometry had no colours.
     skin_bodies, skin_weights : (P, 4) int32, (P, 4) float
-        Bodies that each point follows, the main one first, and by which shares; they sum to one.
+        Bodies that each point follows, the main one first, and by which weights; they sum to one.
     joints : (J, 3) float, metres, world
         At rest.
     joint_bodies : (J, 2) int32

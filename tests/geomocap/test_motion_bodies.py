@@ -12,7 +12,7 @@ from geomocap.bodies.rigid_motions import turn_angles
 from geomocap.errors import GeometryError
 from geomocap.model.hierarchy import Hierarchy
 from geomocap.model.motion_paths import MotionPaths
-from geomocap.pipeline.motion_stage import unsure_turns
+from geomocap.motion import unsure_turns
 from geomocap.skeleton.articulated_motion import fit_articulated, prior_moments
 from geomocap.skeleton.borders import Border
 from geomocap.skeleton.common_points import common_point
@@ -79,7 +79,7 @@ def test_bodies_are_not_split_where_turns_are_unsure(three, seed):
 
 
 def test_turns_of_noise_are_called_unsure(three, found):
-    assert unsure_turns(found) == []
+    assert unsure_turns(found) == ()
     noise = np.random.default_rng(0).normal(0, 0.2, three.positions.shape)  # metres, of boxes 0.12 m wide
     (warning,) = unsure_turns(find_motion_bodies(MotionPaths(three.positions + noise)))
     assert "not to be trusted" in warning and "more cameras" in warning

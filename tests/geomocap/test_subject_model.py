@@ -46,7 +46,7 @@ def take():
 @pytest.fixture(scope="module")
 def model(take):
     bodies, found, _, read = take
-    return build_model(found, bodies, np.array([True]), read, SPACING)
+    return build_model(found, bodies, read, SPACING)
 
 
 def test_surface_is_the_boxes(model, take):
@@ -72,7 +72,7 @@ def test_a_point_that_one_frame_invents_is_left_out(take):
             np.concatenate([cloud.points, ghost]), np.append(cloud.body, 0), np.concatenate([cloud.colors, ghost])
         )
 
-    model = build_model(found, bodies, np.array([True]), with_ghost, SPACING)
+    model = build_model(found, bodies, with_ghost, SPACING)
     assert np.linalg.norm(model.points - 0.5, axis=1).min() > 0.2
 
 
