@@ -12,15 +12,13 @@ from geomocap.calibration.bar_calibration import Calibration
 from geomocap.calibration.calibration_settings import BarSettings
 from geomocap.calibration.from_capture import calibrate_capture
 from geomocap.calibration.world import WorldKnowledge
-from geomocap.files.capture import read_capture_info
 from geomocap.scheduling import threads
 
 
 def calibrate_by_bar(capture: Path, floor: tuple[int, ...] = ()) -> Calibration:
     """Calibrate from CAPTURE/bar; `floor` names frames in which the bar lies on the floor."""
-    world = WorldKnowledge(floor=floor, up=read_capture_info(capture).up)
     with threads() as executor:
-        return calibrate_capture(capture, BarSettings(), world, executor=executor)
+        return calibrate_capture(capture, BarSettings(), WorldKnowledge(floor=floor), executor=executor)
 
 
 def main() -> None:

@@ -15,9 +15,12 @@ from typing import Any
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parent.parent
+OTHERS = "api/others.md"
 _EQUATION = re.compile(r'<(div|span) class="arithmatex">\\[\[(](.*?)\\[\])]</\1>', re.DOTALL)
+_NAME = re.compile(r"(?<!\[)`(geomocap\.(\w+)[\w.]*)`")
 _GENERATED = {
     "settings.md": "# Settings\n\n`geomocap run --help` lists the settings with units, meanings and defaults.\n",
 }
@@ -25,19 +28,34 @@ _GENERATED = {
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """List the API's rooms in the navigation."""
-    pages = [{"geomocap": "api.md"}, *({room: f"api/{room}.md"} for room in rooms())]
+    pages = [{"geomocap": "api.md"}, *({room: f"api/{room}.md"} for room in rooms()), {"other modules": OTHERS}]
     config.nav = [{"API": pages} if entry == {"API": "api.md"} else entry for entry in config.nav or []]
     return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are made from sources: the rooms, the changelog; generated ones that aren't there yet."""
-    made = {f"api/{room}.md": room_page(room) for room in rooms()}
-    made["changelog.md"] = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    made = {f"api/{room}.md": room_page(room) for room in rooms()} | {OTHERS: others_page()}
+    made["changelog.md"] = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").replace("](docs/", "](")
     made |= {name: text for name, text in _GENERATED.items() if files.get_file_from_path(name) is None}
     for name, text in made.items():
         files.append(File.generated(config, name, content=text))
     return files
+
+
+def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+    """Let the pages' names of rooms, modules and functions lead to their place in the API."""
+    if page.file.src_uri.startswith("api/"):
+        return markdown
+    up = "../" * page.file.src_uri.count("/")
+
+    def link(name: re.Match[str]) -> str:
+        room = name[2] in rooms()
+        if room and name[1] == f"geomocap.{name[2]}":
+            return f"[`{name[1]}`]({up}api/{name[2]}.md)"
+        return f"[`{name[1]}`][{name[1]}]" if room or name[2] in _modules(ROOT / "geomocap") else name[0]
+
+    return _NAME.sub(link, markdown)
 
 
 def on_page_content(content: str, **_: Any) -> str:
@@ -60,8 +78,17 @@ def room_page(room: str) -> str:
     """Write the API page of a room: its purpose, then every module with what it offers."""
     folder = ROOT / "geomocap" / room
     purpose = ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8"))) or ""
-    parts = [f"# geomocap.{room}", purpose]
-    parts += [f"::: geomocap.{room}.{module}\n    options:\n      heading_level: 2" for module in _modules(folder)]
+    return _page(f"geomocap.{room}", purpose, [f"geomocap.{room}.{module}" for module in _modules(folder)])
+
+
+def others_page() -> str:
+    """Write the API page of the modules that are in no room."""
+    return _page("Other modules", "Modules that all rooms use.", [f"geomocap.{m}" for m in _modules(ROOT / "geomocap")])
+
+
+def _page(title: str, purpose: str, modules: list[str]) -> str:
+    parts = [f"# {title}", purpose]
+    parts += [f"::: {module}\n    options:\n      heading_level: 2" for module in modules]
     return "\n\n".join(parts) + "\n"
 
 

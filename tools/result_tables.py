@@ -1,10 +1,10 @@
-"""Tables of measured figures as data: one TOML file a table, each row with the commit, seed, command and date it came from.
+"""Tables of measured figures as data: one TOML file a table, each row with its commit, seed, command and date.
 
 A file holds `title`, `order`, `about` and `notes` (Markdown before and after the table), `columns`, and `rows`:
 
     columns = [{label = "capture", cell = "{name}"}, {label = "error (mm)", cell = "{joint_error_mm:.0f}"}]
 
-    [measured]                      # of every row that doesn't say otherwise
+    [measured]                      # of every row that doesn't say its own commit
     commit = "4acc148"
     seed = 0
     date = 2026-11-23
@@ -29,6 +29,7 @@ from typing import Any
 
 import tomli_w
 
+import geomocap
 from geomocap.files.atomic import write_text
 
 MEASURED = ("commit", "seed", "date", "command")
@@ -56,8 +57,8 @@ class ResultTable:
                     raise ValueError(f"{self.path}: row {row.get('name', row)} says no {key}")
 
     def row(self, row: dict[str, Any]) -> dict[str, Any]:
-        """Return a row with where it came from."""
-        return {**self.values.get("measured", {}), **row}
+        """Return a row with where it came from; one that says its own commit says all of it."""
+        return row if "commit" in row else {**self.values.get("measured", {}), **row}
 
     def cells(self, row: dict[str, Any], columns: list[dict[str, str]]) -> list[str]:
         """Return the cells of a row as the table shows them."""
@@ -88,12 +89,8 @@ def measured_now(command: str, seed: int = 0) -> dict[str, Any]:
     """Say where a row that is measured now comes from; a commit with changes on top is marked by a plus sign."""
 
     def git(*words: str) -> str:
-        return subprocess.run(["git", "-C", ROOT, *words], capture_output=True, text=True, check=True).stdout.strip()
+        return subprocess.run(["git", "-C", ROOT, *words], capture_output=True, text=True).stdout.strip()
 
     changed = "+" if git("status", "--porcelain", "--untracked-files=no", "--", "geomocap", "data_tools") else ""
-    return {
-        "commit": git("rev-parse", "--short=7", "HEAD") + changed,
-        "seed": seed,
-        "date": date.today(),
-        "command": command,
-    }
+    commit = git("rev-parse", "--short=7", "HEAD") or f"of version {geomocap.__version__}"
+    return {"commit": commit + changed, "seed": seed, "date": date.today(), "command": command}

@@ -16,8 +16,8 @@ HEAD = """\
 
 # Results
 
-Every figure here was measured, with the commit, seed and command that its table states. Run a command again to check it;
-`python -m tests.benchmarks.quality FOLDER --results docs/results/whole-runs.toml` writes rows of the first table.
+Every figure here was measured, with the commit, seed and command that its table states. Run a command again to check
+it; `python -m tests.benchmarks.quality FOLDER --results docs/results/whole-runs.toml` writes rows of the first table.
 """
 
 
@@ -53,7 +53,9 @@ def provenance(table: ResultTable) -> str:
     for origin, names in origins.items():
         commit, seed, day, command, note = origin
         which = ("All rows" if len(origins) == 1 else "All other rows") if origin == most else "; ".join(names)
-        lines.append((origin == most, f"{which}: commit {commit}, {day}, seed {seed}, `{command}`{', ' * bool(note)}{note}"))
+        lines.append(
+            (origin == most, f"{which}: commit {commit}, {day}, seed {seed}, `{command}`{', ' * bool(note)}{note}")
+        )
     return "*Measured.* " + ".\n".join(line for _, line in sorted(lines, key=lambda line: line[0])) + "."
 
 
