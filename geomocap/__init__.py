@@ -27,27 +27,69 @@ except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0+unknown"
 
 if TYPE_CHECKING:
-    from geomocap.evaluation import evaluate
+    from geomocap.carving.frames import carve
+    from geomocap.carving.volume import working_volume
+    from geomocap.dense.dense_frame import measure_cloud
+    from geomocap.evaluation.run_evaluation import evaluate
     from geomocap.export.run_export import export_run
-    from geomocap.files.capture import Capture
+    from geomocap.files.capture import Capture, open_capture
+    from geomocap.files.scans import ScanSettings, open_scans
+    from geomocap.model.frame_geometry import Voxels
+    from geomocap.model.motion_paths import MotionPaths
+    from geomocap.model.rig import Rig
     from geomocap.motion import Motion, MotionSettings, find_motion
+    from geomocap.segmentation.m3 import segment_m3
+    from geomocap.skeleton.m3_skeleton import skeleton_m3
+    from geomocap.subject.model_building import build_model
+    from geomocap.subject.model_following import follow_model
+    from geomocap.subject.subject_model import SubjectModel, read_model
 
 _HOMES = {  # where each public name is defined
     "Capture": "geomocap.files.capture",
     "Motion": "geomocap.motion",
+    "MotionPaths": "geomocap.model.motion_paths",
     "MotionSettings": "geomocap.motion",
-    "evaluate": "geomocap.evaluation",
+    "Rig": "geomocap.model.rig",
+    "ScanSettings": "geomocap.files.scans",
+    "SubjectModel": "geomocap.subject.subject_model",
+    "Voxels": "geomocap.model.frame_geometry",
+    "build_model": "geomocap.subject.model_building",
+    "carve": "geomocap.carving.frames",
+    "evaluate": "geomocap.evaluation.run_evaluation",
     "export_run": "geomocap.export.run_export",
     "find_motion": "geomocap.motion",
+    "follow_model": "geomocap.subject.model_following",
+    "measure_cloud": "geomocap.dense.dense_frame",
+    "open_capture": "geomocap.files.capture",
+    "open_scans": "geomocap.files.scans",
+    "read_model": "geomocap.subject.subject_model",
+    "segment_m3": "geomocap.segmentation.m3",
+    "skeleton_m3": "geomocap.skeleton.m3_skeleton",
+    "working_volume": "geomocap.carving.volume",
 }
 __all__ = [
     "Capture",
     "Motion",
+    "MotionPaths",
     "MotionSettings",
+    "Rig",
+    "ScanSettings",
+    "SubjectModel",
+    "Voxels",
     "__version__",
+    "build_model",
+    "carve",
     "evaluate",
     "export_run",
     "find_motion",
+    "follow_model",
+    "measure_cloud",
+    "open_capture",
+    "open_scans",
+    "read_model",
+    "segment_m3",
+    "skeleton_m3",
+    "working_volume",
 ]
 
 

@@ -2,7 +2,7 @@
 
 from geomocap.carving.agreement import check_agreement, check_cameras, check_inside, check_silhouettes
 from geomocap.carving.carving_settings import CarvingSettings, ConsistencySettings, HullSettings
-from geomocap.carving.frames import carve_frame, needs_images
+from geomocap.carving.frames import carve, carve_frame, needs_images
 from geomocap.carving.hull import hull, hull_surface, visual_hull
 from geomocap.carving.silhouette_views import PinholeViews, Undistortion, undistort_masks
 from geomocap.carving.volume import working_volume
@@ -15,6 +15,7 @@ __all__ = [
     "HullSettings",
     "PinholeViews",
     "Undistortion",
+    "carve",
     "carve_frame",
     "check_agreement",
     "check_cameras",

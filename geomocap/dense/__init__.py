@@ -1,6 +1,6 @@
 """Surface measurement: the images of one frame become a point cloud."""
 
-from geomocap.dense.dense_frame import CloudFrame, TemplateCloud, cloud_of_frame
+from geomocap.dense.dense_frame import CloudFrame, TemplateCloud, cloud_of_frame, measure_cloud
 from geomocap.dense.dense_settings import CloudSettings
 from geomocap.dense.match_groups import MatchGroup, MatchGroups, match_groups
 from geomocap.dense.matching_images import undistorted_color
@@ -15,5 +15,6 @@ __all__ = [
     "TemplateCloud",
     "cloud_of_frame",
     "match_groups",
+    "measure_cloud",
     "undistorted_color",
 ]

@@ -275,6 +275,22 @@ class Capture:
         return fingerprint([self.path / "capture.toml", *(self.path / p for p in parts)])
 
 
+def open_capture(path: str | Path) -> Capture:
+    """Open a capture: cameras, calibration and frames, read when they are asked for.
+
+    Parameters
+    ----------
+    path : str or Path
+        Its folder.
+
+    Raises
+    ------
+    CaptureError
+        If the folder is no capture, or its parts don't fit together.
+    """
+    return Capture.open(Path(path))
+
+
 def check_links(path: Path) -> None:
     """Raise CaptureError if a symbolic link leads out of a capture folder."""
     root = os.path.realpath(path)

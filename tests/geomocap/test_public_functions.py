@@ -1,4 +1,4 @@
-"""The default method on arrays, without any folder."""
+"""The public functions of values: motion, volumes and clouds without a run folder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import geomocap
-from geomocap.errors import GeometryError
+from geomocap.carving import CarvingSettings
+from geomocap.errors import CaptureError, GeometryError
+from tests.geomocap.ball import RADIUS, Texture, off_surface, photograph, ring
 from tests.geomocap.moving_chains import chain, same_partition
 
 
@@ -62,3 +64,19 @@ def test_importing_the_library_loads_nothing_heavy():
 def test_every_public_name_is_there_and_documented(name):
     assert name in dir(geomocap)
     assert name == "__version__" or getattr(geomocap, name).__doc__
+
+
+def test_one_frame_of_a_ball_is_carved_and_measured():
+    rig = ring(8, 360.0)
+    images, masks = photograph(rig, Texture.random())
+    settings = CarvingSettings(resolution=64)
+    voxels = geomocap.carve(masks, rig, images=images, settings=settings)
+    # A hull stands off between its cameras' rays: of a ring of eight, by less than a fifth of the radius
+    assert off_surface(voxels.points).mean() < 0.2 * RADIUS and len(voxels.colors) == len(voxels.points)
+    found = geomocap.measure_cloud(images, rig, masks=masks, hull=voxels)
+    assert np.median(off_surface(found.points.positions)) < 1e-3  # metres; 0.2 pixels
+
+
+def test_a_capture_that_is_none_is_refused_in_one_line(tmp_path):
+    with pytest.raises(CaptureError, match=r"capture\.toml"):
+        geomocap.open_capture(tmp_path)
