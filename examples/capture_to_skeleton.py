@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geomocap import Capture, pipeline
+import geomocap
+from geomocap import pipeline
 from geomocap.config import Config, load_config
 from geomocap.files.run import Run
 from geomocap.scheduling import threads
@@ -18,7 +19,7 @@ from geomocap.scheduling import threads
 
 def capture_to_skeleton(capture_folder: Path, run_folder: Path, config: Config) -> dict[str, np.ndarray]:
     """Take a capture to motion files, and return the arrays of its skeleton."""
-    capture, run = Capture.open(capture_folder), Run(run_folder)
+    capture, run = geomocap.open_capture(capture_folder), Run(run_folder)
     with threads() as executor:
         job = pipeline.Job(run, config, executor, capture=capture, fps=capture.fps)
         pipeline.motion_files(job, "voxels")  # silhouettes, voxels, tracks, bodies and skeleton come first

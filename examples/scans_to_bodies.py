@@ -12,12 +12,11 @@ import numpy as np
 
 import geomocap
 from geomocap.files.scan_tracks import scan_tracks
-from geomocap.files.scans import ScanSettings, open_scans
 
 
 def scans_to_bodies(folder: Path, fps: float, scale: float = 1.0) -> tuple[geomocap.Motion, list[np.ndarray]]:
     """Return the motion, and the body of each point of each scan, T arrays (N,) int."""
-    scans = open_scans(folder, ScanSettings(scale=scale))
+    scans = geomocap.open_scans(folder, geomocap.ScanSettings(scale=scale))
     points = [scans.points(frame) for frame in range(len(scans))]
     tracks = scan_tracks(scans)  # None unless the scans have their points in common
     motion = geomocap.find_motion(points if tracks is None else tracks, fps=fps)

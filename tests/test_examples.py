@@ -70,7 +70,7 @@ def test_any_scans_to_bodies(tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_a_calibration_by_bar(tmp_path, monkeypatch, capsys):
     settings = SynthesisSettings(
-        cameras=4, width=320, height=240, fps=10, frames=1, bar=60, withhold_calibration=True, distortion=0.0
+        cameras=4, width=320, height=240, fps=10, frames=1, bar=40, withhold_calibration=True, distortion=0.0
     )
     synthesize(figure(), tmp_path / "capture", tmp_path / "truth", settings)
     run_example("calibrate_by_bar", monkeypatch, tmp_path / "capture")

@@ -48,12 +48,13 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     if page.file.src_uri.startswith("api/"):
         return markdown
     up = "../" * page.file.src_uri.count("/")
+    known = {*_modules(ROOT / "geomocap"), *_public()}
 
     def link(name: re.Match[str]) -> str:
         room = name[2] in rooms()
         if room and name[1] == f"geomocap.{name[2]}":
             return f"[`{name[1]}`]({up}api/{name[2]}.md)"
-        return f"[`{name[1]}`][{name[1]}]" if room or name[2] in _modules(ROOT / "geomocap") else name[0]
+        return f"[`{name[1]}`][{name[1]}]" if room or name[2] in known else name[0]
 
     return _NAME.sub(link, markdown)
 
@@ -94,3 +95,9 @@ def _page(title: str, purpose: str, modules: list[str]) -> str:
 
 def _modules(folder: Path) -> list[str]:
     return sorted(p.stem for p in folder.glob("*.py") if not p.stem.startswith("_"))
+
+
+def _public() -> list[str]:
+    tree = ast.parse((ROOT / "geomocap" / "__init__.py").read_text(encoding="utf-8"))
+    lists = [n.value for n in tree.body if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "__all__"]
+    return [name for name in ast.literal_eval(lists[0]) if not name.startswith("_")]
