@@ -8,7 +8,7 @@ OUT ?= demo
 export PYTHON
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test test-fast lint bench clean
+.PHONY: demo test test-fast lint bench docs package clean
 
 demo: .stamps/core
 	$(BIN)/geomocap demo $(OUT)
@@ -27,6 +27,15 @@ lint: .stamps/dev
 bench: .stamps/dev
 	$(BIN)/python -m tests.benchmarks
 
+# The pages, into site/: open site/index.html (the search wants a server: python -m http.server -d site).
+docs: .stamps/dev
+	$(BIN)/python -m tools.results_page
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+# Wheel and source package, into dist/, installed and tried in a clean environment outside of this folder.
+package: .stamps/dev
+	tools/check_package.sh $(BIN)/python
+
 # Python compiles what is used when it is used first; the tests use most of it, in many processes
 # (a few packages bring files for other versions of Python, which can't be compiled).
 .stamps/core: pyproject.toml tools/system_packages.sh
@@ -42,5 +51,5 @@ bench: .stamps/dev
 	touch $@
 
 clean:
-	rm -rf $(VENV) .stamps $(OUT) .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .stamps $(OUT) site build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} +
