@@ -81,7 +81,7 @@ def doll(duration: float = 1.5, limb_bones: int = 1) -> AnimatedAsset:
     """Make a doll with a soft trunk that bends, one skin over hips and chest: 7 bodies.
 
     The skin follows both bones by parts that sum to 1, 12 cm to both sides of the waist. With `limb_bones` = 2 its
-    elbows and knees are soft too, 5 cm to both sides: 11 bodies.
+    elbows and knees are soft too, 5 cm to both sides: 11 bodies. With 0 there are no limbs: 3 bodies.
     """
     cloth, skin = (0.5, 0.6, 0.7), (0.8, 0.65, 0.5)
     parts = [
@@ -91,7 +91,8 @@ def doll(duration: float = 1.5, limb_bones: int = 1) -> AnimatedAsset:
         Part("head", "chest", (0, 0, 0.4), (ellipsoid((0.09, 0.11, 0.13), (0, 0, 0.13)),), skin,
              ((Z, 0, 32, 1, 0.7), (X, 0, 15, 1, 2.9))),
     ]  # fmt: skip
-    for side, sign, phase in (("left", 1.0, 0.0), ("right", -1.0, np.pi)):
+    sides = (("left", 1.0, 0.0), ("right", -1.0, np.pi)) if limb_bones else ()
+    for side, sign, phase in sides:
         arm, leg = f"{side}_arm", f"{side}_leg"
         parts += [
             Part(arm, "chest", (sign * 0.16, 0, 0.26), (ellipsoid((0.06, 0.06, 0.31), (0, 0, -0.27), rings=41),), skin,
