@@ -10,10 +10,9 @@ from importlib.metadata import PackageNotFoundError, version
 # several times slower. Read when OpenMP is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-import numba
+from geomocap.kernel_cache import configure_numba
 
-# Frames are mapped over threads that each call parallel kernels: of Numba's layers only OpenMP allows that.
-numba.config.THREADING_LAYER = "omp"  # type: ignore[attr-defined]
+configure_numba()
 
 try:
     __version__ = version("geomocap")

@@ -33,6 +33,7 @@ def silhouettes(job: Job) -> str:
     if capture is None:
         raise CaptureError("silhouettes need a capture")
     key = stage_key(
+        __name__,
         "silhouettes",
         str(capture.path.resolve()),
         capture.fingerprint("images", "videos", "background", "masks", "sparse"),

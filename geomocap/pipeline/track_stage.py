@@ -42,7 +42,7 @@ def tracks(job: Job) -> str:
     tables = ("tracking", "filters", "smoothing")
     settings = {name: getattr(job.config, name).model_dump() for name in tables}
     surface = voxels(job) if _has_hull(capture) else clouds(job)
-    key = stage_key("tracks", surface, pictures, settings, job.fps)
+    key = stage_key(__name__, "tracks", surface, pictures, settings, job.fps)
     job.write_record(*tables)
     return job.stage("tracks", key, ["tracks.npz"], lambda: _track(job, capture), KEYPOINT_FILES)
 
