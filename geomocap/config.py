@@ -11,7 +11,7 @@ from geomocap.bodies.motion_bodies import MotionBodiesSettings
 from geomocap.carving.carving_settings import CarvingSettings
 from geomocap.dense.dense_settings import CloudSettings
 from geomocap.export.export_settings import ExportSettings
-from geomocap.files.scans import ScanSettings
+from geomocap.files.scan_settings import ScanSettings
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.segmentation.m3_settings import SegmentationSettings
@@ -21,8 +21,7 @@ from geomocap.silhouettes import SilhouetteSettings
 from geomocap.skeleton.motion_skeleton import MotionSkeletonSettings
 from geomocap.skeleton.refinement import RefinementSettings
 from geomocap.subject.model_following import FollowingSettings
-from geomocap.trajectories.filters import FilterSettings
-from geomocap.trajectories.smoothing import SmoothingSettings
+from geomocap.trajectories.trajectory_settings import FilterSettings, SmoothingSettings
 
 
 class Config(Settings):

@@ -9,7 +9,8 @@ import numpy as np
 import open3d as o3d
 
 from geomocap.config import load_config
-from geomocap.dense import CloudFrame, TemplateCloud, undistorted_color
+from geomocap.dense.dense_frame import CloudFrame, TemplateCloud
+from geomocap.dense.matching_images import undistorted_color
 from geomocap.errors import GeomocapError
 from geomocap.matching.growing import SurfaceMatches
 from geomocap.pipeline.cloud_stage import measure_again

@@ -6,8 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from geomocap.matching.matching_settings import GrowingSettings, KernelSettings, SeedSettings
-from geomocap.matching.wallis import WallisSettings
+from geomocap.matching.matching_settings import GrowingSettings, KernelSettings, SeedSettings, WallisSettings
 from geomocap.settings import Settings
 
 

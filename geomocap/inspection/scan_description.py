@@ -8,8 +8,9 @@ import numpy as np
 
 from geomocap.errors import GeomocapError
 from geomocap.files.scan_geometry import ScanSurface
+from geomocap.files.scan_settings import ScanSettings
 from geomocap.files.scan_tracks import scan_tracks
-from geomocap.files.scans import Scans, ScanSettings, open_scans
+from geomocap.files.scans import Scans, open_scans
 from geomocap.inspection.capture_description import MOST_NAMED
 from geomocap.inspection.description import Description, count
 

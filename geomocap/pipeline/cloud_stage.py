@@ -11,7 +11,9 @@ from typing import Literal
 import numba
 import open3d as o3d
 
-from geomocap.dense import CloudFrame, CloudSettings, MatchGroups, cloud_of_frame, match_groups
+from geomocap.dense.dense_frame import CloudFrame, cloud_of_frame
+from geomocap.dense.dense_settings import CloudSettings
+from geomocap.dense.match_groups import MatchGroups, match_groups
 from geomocap.errors import CaptureError, GeometryError, RunError
 from geomocap.files.atomic import write_atomic, write_text
 from geomocap.files.capture import Capture

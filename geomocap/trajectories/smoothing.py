@@ -14,19 +14,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import Field
 
 from geomocap.errors import GeometryError
-from geomocap.settings import Settings
+from geomocap.trajectories.trajectory_settings import SmoothingSettings
 
 _REGULAR = 1e-9
-
-
-class SmoothingSettings(Settings):
-    """How velocities and accelerations are estimated."""
-
-    half_width: int = Field(3, ge=1, description="Frames on each side that a velocity is estimated from")
-    degree: int = Field(3, ge=1, le=4, description="Degree of the polynomial in time")
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from geomocap.matching.foerstner import foerstner, interest_points
-from geomocap.matching.wallis import WallisSettings, local_statistics, wallis
+from geomocap.matching.matching_settings import WallisSettings
+from geomocap.matching.wallis import local_statistics, wallis
 
 
 def window_of(image: np.ndarray, row: int, column: int, half: int) -> np.ndarray:
