@@ -14,7 +14,9 @@ class GroupSettings(Settings):
     """Which cameras are matched with each other."""
 
     templates: Literal["auto", "one", "all"] = Field(
-        "auto", description="one: the most central camera; all: every camera; auto: one up to three cameras"
+        "auto",
+        description="one: the most central camera; all: every camera; auto: one up to three cameras",
+        json_schema_extra={"flag": "templates"},
     )
     template_camera: str | None = Field(
         None, description="the template if there is only one; the most central if not given"
@@ -67,10 +69,15 @@ class CloudSettings(Settings):
     trust: TrustSettings = Field(default_factory=TrustSettings, description="when matches are believed")
     merge: MergeSettings = Field(default_factory=MergeSettings, description="how clouds become one")
     bounds: Literal["auto", "hull", "silhouettes", "none"] = Field(
-        "auto", description="what bounds the search; auto: the most that cameras, masks and backgrounds allow"
+        "auto",
+        description="what bounds the search; auto: the most that cameras, masks and backgrounds allow",
+        json_schema_extra={"flag": "bounds"},
     )
     spacing: float | None = Field(
-        None, gt=0, description="distance of neighbouring points on the surface, instead of growing.step (m)"
+        None,
+        gt=0,
+        description="distance of neighbouring points on the surface, instead of growing.step (m)",
+        json_schema_extra={"flag": "cloud-spacing"},
     )
     least_views: int = Field(2, ge=2, description="cameras that have to see a point, the template included")
     contour_margin: int = Field(1, ge=0, description="pixels along a silhouette's contour that are not used (px)")

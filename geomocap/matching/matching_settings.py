@@ -52,6 +52,7 @@ class GrowingSettings(Settings):
         gt=0.25,
         description="distance of neighbouring points in the template image; if not given 1.5, 2 with several "
         "templates, less in small images (px)",
+        json_schema_extra={"flag": "cloud-step"},
     )
     order: Literal["best", "paper"] = Field(
         "best", description="best: best neighbour first; paper: sequential horizontal and vertical shifts"

@@ -15,6 +15,7 @@ class SegmentationSettings(Settings):
     method: Literal["motion", "m3"] = Field(
         default="motion",
         description="motion: bodies from how the tracked surface turns; m3: the paper's split, merge, match and paths",
+        json_schema_extra={"flag": "method"},
     )
     paths: Literal["auto", "patches", "nodes", "both", "points", "ellipsoids"] = Field(
         default="auto",
@@ -22,6 +23,7 @@ class SegmentationSettings(Settings):
         "not tracked at all); both: nodes that patches keep from sliding; points: those of scans which are the same in "
         "all frames; ellipsoids: the paper's, split, merged and matched, for comparison; auto: of a capture patches "
         "where they cover the subject, otherwise both; of scans points where neighbours stay so, otherwise nodes",
+        json_schema_extra={"flag": "paths"},
     )
     max_depth: int = Field(
         default=7, ge=1, le=10, description="levels of splitting; at most 2^levels ellipsoids a frame"

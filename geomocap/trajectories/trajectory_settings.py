@@ -10,8 +10,12 @@ from geomocap.settings import Settings
 class FilterSettings(Settings):
     """Which trajectories are cut or removed."""
 
-    on: bool = Field(True, description="Cut and remove trajectories that can't be true")
-    fastest: float | None = Field(None, gt=0, description="Highest speed (m/s); from the data if not given")
+    on: bool = Field(
+        True, description="Cut and remove trajectories that can't be true", json_schema_extra={"flag": "filters"}
+    )
+    fastest: float | None = Field(
+        None, gt=0, description="Highest speed (m/s); from the data if not given", json_schema_extra={"flag": "fastest"}
+    )
     acceleration: float | None = Field(
         None, gt=0, description="Highest acceleration (m/s²); from the data if not given"
     )
@@ -28,5 +32,10 @@ class FilterSettings(Settings):
 class SmoothingSettings(Settings):
     """How velocities and accelerations are estimated."""
 
-    half_width: int = Field(3, ge=1, description="Frames on each side that a velocity is estimated from")
+    half_width: int = Field(
+        3,
+        ge=1,
+        description="Frames on each side that a velocity is estimated from",
+        json_schema_extra={"flag": "half-width"},
+    )
     degree: int = Field(3, ge=1, le=4, description="Degree of the polynomial in time")
