@@ -14,7 +14,11 @@ class MotionBodiesSettings(Settings):
         default=0, ge=0, description="number of bodies; 0: found automatically", json_schema_extra={"flag": "bodies"}
     )
     min_turn_deg: float = Field(
-        default=15.0, gt=0, lt=180, description="a body turns at least this much against each neighbour (degrees)"
+        default=15.0,
+        gt=0,
+        lt=180,
+        description="a body turns at least this much against each neighbour (degrees)",
+        json_schema_extra={"flag": "min-turn"},
     )
     part_turn_deg: float = Field(
         default=12.0,
@@ -43,6 +47,7 @@ class MotionBodiesSettings(Settings):
         lt=0.5,
         description="smallest body (fraction of the samples; what one camera alone sees counts two thirds), unless "
         "two others hang together by it",
+        json_schema_extra={"flag": "min-fraction"},
     )
     soft_fraction: float = Field(
         default=0.18,
@@ -63,7 +68,11 @@ class MotionBodiesSettings(Settings):
         ge=0,
         description="times that depths of what single cameras see are found from the bodies, and bodies from these",
     )
-    blends: bool = Field(default=True, description="samples may follow a blend of two bodies, as soft skin does")
+    blends: bool = Field(
+        default=True,
+        description="samples may follow a blend of two bodies, as soft skin does",
+        json_schema_extra={"flag": "soft-borders"},
+    )
     blend_penalty: float = Field(
         default=0.004, ge=0, description="an even blend of two bodies counts as a residual of this (diagonals)"
     )

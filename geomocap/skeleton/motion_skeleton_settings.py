@@ -27,7 +27,10 @@ class MotionSkeletonSettings(Settings):
     )
     largest_gap: float = Field(default=0.1, gt=0, description="bodies farther apart are not connected (diagonals)")
     smoothing: float = Field(
-        default=0.0, ge=0, description="weight of an even pace against the samples; 1 halves what changes in 3 frames"
+        default=0.0,
+        ge=0,
+        description="weight of an even pace against the samples; 1 halves what changes in 3 frames",
+        json_schema_extra={"flag": "joint-smoothing"},
     )
     rounds: int = Field(default=6, ge=1, description="rounds of the fit that keeps joints together")
 
@@ -36,7 +39,10 @@ class RefinementSettings(Settings):
     """How the motion of connected bodies is refined over all frames."""
 
     rounds: int = Field(
-        default=3, ge=0, description="rounds of skin weights, shape, and motion with joints; 0: no refinement"
+        default=3,
+        ge=0,
+        description="rounds of skin weights, shape, and motion with joints; 0: no refinement",
+        json_schema_extra={"flag": "refinement"},
     )
     steps: int = Field(default=4, ge=1, description="steps of each adjustment of motion and joints")
     independence: float = Field(

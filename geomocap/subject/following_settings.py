@@ -11,7 +11,12 @@ class FollowingSettings(Settings):
     """How the model of a subject is followed through another sequence."""
 
     points: int = Field(default=1200, ge=100, description="points of the model, and of each frame, that are matched")
-    start_frames: int = Field(default=4, ge=1, description="frames in which the model is looked for")
+    start_frames: int = Field(
+        default=4,
+        ge=1,
+        description="frames in which the model is looked for",
+        json_schema_extra={"flag": "start-frames"},
+    )
     steps: int = Field(default=8, ge=1, description="times that points are matched anew in each frame")
     rounds: int = Field(default=5, ge=0, description="rounds in which all frames are fitted together")
     normal: float = Field(default=0.03, ge=0, description="weight of normals in matching (diagonals)")
