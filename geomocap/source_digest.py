@@ -20,6 +20,8 @@ PACKAGES = ("geomocap", "data_tools", "viz")
 # stage to the settings of all others. What the package itself offers is no part of a stage either.
 NOT_FOLLOWED = frozenset({"geomocap", "geomocap.config"})
 
+_DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+
 
 @cache
 def module_digest(module: str) -> str:
@@ -97,12 +99,14 @@ def _statements(node: ast.AST) -> Iterator[ast.stmt]:
 
 
 def code_digest(tree: ast.Module) -> str:
-    """Digest of what a source does: of its byte code without docstrings, assertions and line numbers."""
+    """Digest of what a source does: of its byte code without docstrings and line numbers."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.keyword) and node.arg == "description" and isinstance(node.value, ast.Constant):
-            node.value.value = ""
+        if isinstance(node, ast.keyword) and node.arg in ("description", "json_schema_extra"):
+            node.value = ast.copy_location(ast.Constant(None), node.value)
+        elif isinstance(node, _DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
+            node.body = node.body[1:] or [ast.copy_location(ast.Pass(), node.body[0])]
     digest = hashlib.blake2b(digest_size=16)
-    digest.update(repr(_said(compile(tree, "", "exec", dont_inherit=True, optimize=2))).encode())
+    digest.update(repr(_said(compile(tree, "", "exec", dont_inherit=True, optimize=0))).encode())
     return digest.hexdigest()
 
 

@@ -325,7 +325,7 @@ def _separation(results: Results, stage: ViewStage | None, desk: Desk) -> list[B
     words = (
         f"The bodies come from {len(found['sample_body'])} {followed}, followed through all frames. Where a subject "
         "bends in many small steps, like a trunk or a tail, any border is arbitrary: the other numbers of bodies are "
-        "as good. --bodies sets a number, --motion_bodies.min_turn_deg the criterion."
+        "as good. --bodies sets a number, --min-turn the criterion."
     )
     blocks = desk.sheet("alternatives", separation.alternatives_sheet(results, stage), "Samples by body", words)
     if "curve_bodies" in found and len(found["curve_bodies"]) > 1:

@@ -26,7 +26,6 @@ class HullSettings(Settings):
         ge=0,
         description="cameras that must have a say of a voxel, where some may not see it (count); 0: half of those that "
         "see the subject, three at least",
-        json_schema_extra={"flag": "min-views"},
     )
     tolerance: int = Field(default=0, ge=0, description="cameras that may call a voxel background and it stays (count)")
 

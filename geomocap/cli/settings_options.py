@@ -38,16 +38,18 @@ def with_settings(*sections: str) -> Callable[[Command], Command]:
     The command gets the merged settings as its keyword argument `config`.
     """
     fields = {key: field for key, field in leaves(Config) if key.split(".")[0] in sections}
-    return _with_options("config", fields, load_config, "Settings file; a run's own run.toml repeats that run.")
+    flags = {key: flag for key, field in fields.items() if (flag := flag_of(field)) is not None}
+    return _with_options("config", fields, flags, load_config, "Settings file; a run's own run.toml repeats that run.")
 
 
 def with_options_of(model: type[Settings]) -> Callable[[Command], Command]:
-    """Give a command `--config FILE.toml`, `--set KEY=VALUE` and the flags of a model's settings.
+    """Give a command `--config FILE.toml`, `--set KEY=VALUE` and a flag `--key` for each setting of its own model.
 
     The command gets the merged settings as its keyword argument `settings`.
     """
+    fields = dict(leaves(model))
     build = functools.partial(load_settings, model)
-    return _with_options("settings", dict(leaves(model)), build, "Settings file: the keys of this command alone.")
+    return _with_options("settings", fields, {k: k for k in fields}, build, "Settings file: keys without tables.")
 
 
 def with_file_of_options(command: Command) -> Command:
@@ -86,10 +88,12 @@ def _read_options(context: typer.Context, file: Path | None) -> Path | None:
 
 
 def _with_options(
-    name: str, fields: Fields, build: Callable[[Path | None, dict[str, Any]], Settings], file_help: str
+    name: str,
+    fields: Fields,
+    flags: Mapping[str, str],
+    build: Callable[[Path | None, dict[str, Any]], Settings],
+    file_help: str,
 ) -> Callable[[Command], Command]:
-    flags = {key: flag for key, field in fields.items() if (flag := flag_of(field)) is not None}
-
     def decorate(command: Command) -> Command:
         signature = inspect.signature(command, eval_str=True)
         file = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml", help=file_help)]
@@ -98,7 +102,7 @@ def _with_options(
         one = Annotated[list[str] | None, typer.Option("--set", metavar=f"{example}=VALUE", help=set_help)]
         parameters = [p for p in signature.parameters.values() if p.name != name]
         parameters += [_parameter("config_file", file), _parameter("set_values", one)]
-        parameters += [_parameter(f"{_FLAG}{n}", _option(k, fields[k])) for n, k in enumerate(flags)]
+        parameters += [_parameter(f"{_FLAG}{n}", _option(k, flags[k], fields[k])) for n, k in enumerate(flags)]
 
         @functools.wraps(command)
         def wrapper(**arguments: Any) -> None:
@@ -193,7 +197,7 @@ def _nested(given: Sequence[str], fields: Fields) -> dict[str, Any]:
         table = values
         for part in tables:
             table = table.setdefault(part, {})
-        table[last] = _parse(value.strip())
+        table[last] = _parse(value.strip(), fields[key].annotation)
     return values
 
 
@@ -201,17 +205,17 @@ def _parameter(name: str, annotation: Any) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
 
 
-def _option(key: str, field: FieldInfo) -> Any:
+def _option(key: str, flag: str, field: FieldInfo) -> Any:
     default = field.get_default(call_default_factory=True)
     table, _, last = key.rpartition(".")
     return Annotated[
         str | None,
         typer.Option(
-            f"--{flag_of(field)}",
+            f"--{flag}",
             metavar=_type_name(field.annotation),
             help=field.description or last.replace("_", " "),
             show_default="none" if default is None else json.dumps(default).strip('"'),
-            rich_help_panel=f"Settings [{table.split('.')[0]}]" if table else "Settings",
+            rich_help_panel=f"Settings: {table.split('.')[0]}" if table else "Settings",
         ),
     ]
 
@@ -228,8 +232,10 @@ def _type_name(annotation: Any) -> str:
     return {int: "INT", float: "NUMBER", bool: "true|false", str: "TEXT", Path: "PATH"}.get(annotation, "VALUE")
 
 
-def _parse(text: str) -> Any:
-    """Read a value as TOML does; what isn't TOML is a string."""
+def _parse(text: str, annotation: Any) -> Any:
+    """Read a value as TOML does; what isn't TOML, and an unquoted word where one is expected, is a string."""
+    if text in typing.get_args(annotation) or (annotation in (str, str | None) and text[:1] not in "\"'"):
+        return text
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:

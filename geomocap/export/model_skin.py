@@ -36,7 +36,7 @@ def skin_from_model(model: SubjectModel, motion: MotionTree, settings: ExportSet
     found = int(motion.bodies.max()) + 1
     if found != model.body_count:
         raise MotionError(
-            f"skin: model.npz has {model.body_count} bodies, skeleton.npz {found}; run again, or --export.surface bones"
+            f"skin: model.npz has {model.body_count} bodies, skeleton.npz {found}; run again, or --surface bones"
         )
     surface = surface_through(model.points, model.normals, settings.skin_triangles)
     distance, nearest = cKDTree(model.points).query(surface.vertices, min(NEAREST, len(model.points)))

@@ -38,7 +38,7 @@ def describe_scans(path: Path) -> Description:
         told.fact("missing points", f"{missing:.1%} (NaN)")
     low = np.min([np.nanmin(s.points, axis=0) for s in surfaces], axis=0)
     high = np.max([np.nanmax(s.points, axis=0) for s in surfaces], axis=0)
-    told.fact("box around all", " × ".join(f"{side:.4g}" for side in high - low) + ", taken for metres (--scans.scale)")
+    told.fact("box around all", " × ".join(f"{side:.4g}" for side in high - low) + ", taken for metres (--scale)")
     if len(scans) == 1:
         told.fact("motion", "none: one scan gets its ellipsoids")
     elif not told.problems:

@@ -45,7 +45,6 @@ class TrackingSettings(Settings):
     templates: Literal["first", "updated", "previous"] = Field(
         "updated",
         description="Template: the first view of a camera, a new one where it fits badly, or the last frame's",
-        json_schema_extra={"flag": "patch-templates"},
     )
     seed_every: int = Field(
         10, ge=1, description="Frames between two looks for surface without patches; the last frame is looked at too"

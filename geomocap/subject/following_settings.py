@@ -15,7 +15,6 @@ class FollowingSettings(Settings):
         default=4,
         ge=1,
         description="frames in which the model is looked for",
-        json_schema_extra={"flag": "start-frames"},
     )
     steps: int = Field(default=8, ge=1, description="times that points are matched anew in each frame")
     rounds: int = Field(default=5, ge=0, description="rounds in which all frames are fitted together")
