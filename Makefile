@@ -8,7 +8,7 @@ OUT ?= demo
 export PYTHON
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test test-fast lint bench clean
+.PHONY: demo test test-fast lint bench settings clean
 
 demo: .stamps/core
 	$(BIN)/geomocap demo $(OUT)
@@ -26,6 +26,10 @@ lint: .stamps/dev
 
 bench: .stamps/dev
 	$(BIN)/python -m tests.benchmarks
+
+# docs/settings.md, written from the settings models
+settings: .stamps/dev
+	$(BIN)/python -m tools.settings_page
 
 # Python compiles what is used when it is used first; the tests use most of it, in many processes
 # (a few packages bring files for other versions of Python, which can't be compiled).

@@ -25,8 +25,8 @@ class GroupSettings(Settings):
     least_angle: float = Field(6.0, ge=0, lt=90, description="least angle between viewing directions (degrees)")
     best_angle: float = Field(25.0, gt=0, lt=90, description="angle between viewing directions aimed at (degrees)")
     greatest_angle: float = Field(60.0, gt=0, lt=120, description="greatest angle between viewing directions (degrees)")
-    near: float = Field(0.5, gt=0, description="least depth where nothing else bounds it, in distances of the scene")
-    far: float = Field(1.6, gt=0, description="greatest depth, likewise")
+    near: float = Field(0.5, gt=0, description="least depth where nothing else bounds it (fraction of the scene's)")
+    far: float = Field(1.6, gt=0, description="greatest depth, likewise (fraction of the scene's)")
 
 
 class MergeSettings(Settings):
@@ -83,6 +83,6 @@ class CloudSettings(Settings):
     contour_margin: int = Field(1, ge=0, description="pixels along a silhouette's contour that are not used (px)")
     silhouette_margin: int = Field(3, ge=0, description="how far points may project outside other silhouettes (px)")
     hull_depth: float = Field(
-        0.1, gt=0, description="how far behind the hull's front the surface is sought, in diagonals of the hull"
+        0.1, gt=0, description="how far behind the hull's front the surface is sought (diagonals of the hull)"
     )
     normal_radius: int = Field(1, ge=0, le=5, description="cells around a point whose slopes make its normal")

@@ -36,7 +36,7 @@ class ExportSettings(Settings):
     skin_frame: int = Field(
         0,
         ge=0,
-        description="reference frame whose surface is taken; a subject's model is used for frame 0",
+        description="reference whose surface is taken (frame); a subject's model is used for frame 0",
         json_schema_extra={"flag": "skin-frame"},
     )
     skin_colors: Literal["body", "true"] = Field(
