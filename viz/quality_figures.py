@@ -26,7 +26,7 @@ class Coverage:
     fraction : (C, T) float
         Fraction of the pixels, 0–1, NaN where there is no silhouette.
     cut : (C, T) bool
-        Whether the silhouette runs along the image's border: the subject is partly out of ray.
+        Whether the silhouette runs along the image's border: the subject is partly out of sight.
     """
 
     cameras: tuple[str, ...]

@@ -10,6 +10,8 @@ from geomocap.settings import Settings
 
 Point = tuple[float, float, float]
 
+ENCLOSING = 4  # cameras that enclose a subject; the hull of fewer bounds nothing
+
 
 class HullSettings(Settings):
     """When a voxel belongs to the visual hull."""

@@ -11,6 +11,7 @@ from typing import Literal
 import numba
 import open3d as o3d
 
+from geomocap.carving.carving_settings import ENCLOSING
 from geomocap.dense.dense_frame import CloudFrame, cloud_of_frame
 from geomocap.dense.dense_settings import CloudSettings
 from geomocap.dense.match_groups import MatchGroups, match_groups
@@ -25,7 +26,6 @@ from geomocap.pipeline.silhouette_stage import silhouettes
 from geomocap.pipeline.voxel_stage import voxels
 from geomocap.scheduling import map_items
 
-HULL_CAMERAS = 4  # fewer cameras don't enclose the subject: their hull bounds nothing
 BACKGROUND_FRAMES = 10  # fewer frames without a background picture don't show what moves
 
 Bounds = Literal["hull", "silhouettes", "none"]
@@ -72,7 +72,7 @@ def bounds_of(capture: Capture, settings: CloudSettings) -> Bounds:
     plates = all(capture.has_background(c) for c in capture.cameras)
     if not (capture.has_masks or plates or capture.n_recorded >= BACKGROUND_FRAMES):
         return "none"
-    return "hull" if len(capture.cameras) >= HULL_CAMERAS else "silhouettes"
+    return "hull" if len(capture.cameras) >= ENCLOSING else "silhouettes"
 
 
 @dataclass(frozen=True)
