@@ -130,33 +130,72 @@ def _sources(root: Path) -> list[str]:
 
 
 def kernels_digest(root: Path) -> str:
-    """Digest of all kernels in the packages below a folder, and of the constants that they may use.
-
-    These are the kernels' own functions, and what is assigned at the top of their modules and of those that are
-    imported there.
-    """
-    trees = {n: ast.parse((root / n).read_bytes()) for n in _sources(root) if b"njit" in (root / n).read_bytes()}
-    for name in {m for tree in trees.values() for m in _imported(tree)} - trees.keys():
-        if (root / name).is_file():
-            trees[name] = ast.parse((root / name).read_bytes())
-    digest = hashlib.blake2b(digest_size=12)
-    for name in sorted(trees):
-        for node in trees[name].body:
-            if isinstance(node, ast.Assign | ast.AnnAssign):
-                digest.update(f"{name} {ast.dump(node)}\n".encode())
-            elif isinstance(node, ast.FunctionDef) and node.decorator_list:
-                if ast.get_docstring(node) is not None:
-                    del node.body[0]
-                digest.update(f"{name} {ast.dump(node)}\n".encode())
-    return digest.hexdigest()
+    """Digest of all kernels in the packages below a folder, and of the constants that they use, wherever they stand."""
+    texts = {name: (root / name).read_bytes() for name in _sources(root)}
+    trees = {name: ast.parse(text) for name, text in texts.items() if b"njit" in text}
+    kernels = {name: [n for n in trees[name].body if _is_kernel(n)] for name in trees}
+    used = {name: {word for kernel in kernels[name] for word in _words(kernel)} for name in trees}
+    said = {f"{name} {_said(kernel)}" for name in kernels for kernel in kernels[name]}
+    waiting = list(trees)
+    while waiting:
+        name = waiting.pop()
+        tree = trees[name] if name in trees else trees.setdefault(name, ast.parse(texts[name]))
+        for node in _constants(tree, used[name]):
+            said.add(f"{name} {ast.dump(node)}")
+        for source, words in _imported(tree, used[name]):
+            if source in texts and not words <= used.setdefault(source, set()):
+                used[source] |= words
+                waiting.append(source)
+    return hashlib.blake2b("\n".join(sorted(said)).encode(), digest_size=12).hexdigest()
 
 
-def _imported(tree: ast.Module) -> Iterator[str]:
-    """Sources that names may be imported from at the top of a module."""
+def _is_kernel(node: ast.stmt) -> bool:
+    return isinstance(node, ast.FunctionDef) and bool(node.decorator_list)
+
+
+def _words(node: ast.AST) -> Iterator[str]:
+    """Names that a piece of code uses."""
+    for part in ast.walk(node):
+        if isinstance(part, ast.Name):
+            yield part.id
+        elif isinstance(part, ast.Attribute):
+            yield part.attr
+
+
+def _said(kernel: ast.stmt) -> str:
+    """Text of a kernel without its docstring."""
+    assert isinstance(kernel, ast.FunctionDef)
+    body = kernel.body[ast.get_docstring(kernel) is not None :]
+    return " ".join(ast.dump(part) for part in (kernel.args, *kernel.decorator_list, *body)) + kernel.name
+
+
+def _constants(tree: ast.Module, used: set[str]) -> list[ast.stmt]:
+    """Assignments at the top of a module to the names `used`; names that these use are added."""
+    found: list[ast.stmt] = []
+    assignments = [n for n in tree.body if isinstance(n, ast.Assign | ast.AnnAssign)]
+    more = True
+    while more:
+        new = [n for n in assignments if n not in found and used & set(_targets(n))]
+        used.update(word for node in new for word in _words(node))
+        found += new
+        more = bool(new)
+    return found
+
+
+def _targets(node: ast.Assign | ast.AnnAssign) -> Iterator[str]:
+    for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+        yield from _words(target)
+
+
+def _imported(tree: ast.Module, used: set[str]) -> Iterator[tuple[str, set[str]]]:
+    """Sources that a module imports some of the names `used` from, and these names."""
     for node in tree.body:
         if isinstance(node, ast.ImportFrom) and node.module is not None:
             source = node.module.replace(".", "/")
-            yield from (f"{source}.py", *(f"{source}/{alias.name}.py" for alias in node.names))
+            yield f"{source}.py", {alias.name for alias in node.names if (alias.asname or alias.name) in used}
+            for alias in node.names:
+                if (alias.asname or alias.name) in used:  # a module whose constants are used by its name
+                    yield f"{source}/{alias.name}.py", used
 
 
 def _tidy(base: Path) -> None:

@@ -7,3 +7,5 @@ from viz.picture_files import render_file
 from viz.review import review
 
 __all__ = ["render_file", "review"]
+
+import geomocap as geomocap  # it says where compiled kernels are kept, before there are any

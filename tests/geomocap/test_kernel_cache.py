@@ -32,12 +32,22 @@ def outer(x):
 def plain(x):
     return outer(x)
 """
+NUMBERS = """
+from geomocap.far import BASE
+HALF = BASE / 2
+STEP = 2 * HALF
+UNUSED = 5
+
+def far():
+    return 3
+"""
+FAR = "BASE = 1\nOTHER = 2\n"
 
 
 @pytest.fixture
 def sources(tmp_path):
     (tmp_path / "geomocap").mkdir()
-    files = {"called": CALLED, "caller": CALLER, "numbers": "STEP = 1\ndef far():\n    return 3\n", "other": "x = 1\n"}
+    files = {"called": CALLED, "caller": CALLER, "numbers": NUMBERS, "far": FAR, "other": "x = 1\n"}
     for name, text in files.items():
         (tmp_path / f"geomocap/{name}.py").write_text(text)
     return tmp_path
@@ -48,7 +58,11 @@ def sources(tmp_path):
     [
         ("called", "2 * x", "3 * x", True),
         ("called", "cache=True", "cache=True, fastmath=True", True),
-        ("numbers", "STEP = 1", "STEP = 2", True),
+        ("numbers", "2 * HALF", "4 * HALF", True),
+        ("numbers", "BASE / 2", "BASE / 4", True),
+        ("far", "BASE = 1", "BASE = 2", True),
+        ("far", "OTHER = 2", "OTHER = 3", False),
+        ("numbers", "UNUSED = 5", "UNUSED = 6", False),
         ("called", "twice", "two times", False),
         ("called", "Double it.", "Times two.", False),
         ("called", '"""Words."""', '"""Words."""\n\n', False),
@@ -75,7 +89,7 @@ def test_a_kernel_is_compiled_anew_when_one_that_it_calls_in_another_file_change
     environment.pop("GEOMOCAP_KERNEL_CACHE", None)
     code = (
         "from geomocap.caller import outer\n"
-        "print(outer(5), sum(outer.stats.cache_hits.values()), sum(outer.stats.cache_misses.values()))"
+        "print(int(outer(5)), sum(outer.stats.cache_hits.values()), sum(outer.stats.cache_misses.values()))"
     )
 
     def value_hits_misses():
