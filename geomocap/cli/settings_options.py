@@ -177,8 +177,10 @@ class _SetArguments:
                 f"--{name} is no flag: it is the key {key} of the table {tables} in the settings file; "
                 f"here it is --set {found[0]}=VALUE"
             )
-        if "." in key and any(key == k for k, _ in leaves(Config)):
-            raise SettingsError(f"--{name}: this command takes no settings of the table [{key.rpartition('.')[0]}]")
+        elsewhere = [k for k, field in leaves(Config) if name == flag_of(field) or key in (k, k.rpartition(".")[2])]
+        if elsewhere:
+            tables = " or ".join(f"[{k.rpartition('.')[0]}]" for k in elsewhere)
+            raise SettingsError(f"--{name}: this command takes no settings of the table {tables}")
 
 
 def _nested(given: Sequence[str], fields: Fields) -> dict[str, Any]:

@@ -66,7 +66,8 @@ def test_keys_without_a_flag_nested_tables_and_lists(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--hinge_fraction", "1"], "No such option"),  # of no table of this command
+        (["--hinge_fraction", "1"], r"takes no settings of the table \[motion_skeleton\]"),
+        (["--refinement", "1"], r"takes no settings of the table \[refinement\]"),
         (["--min-excess-deg", "2"], r"key min_excess_deg of the table \[motion_bodies\].*--set motion_bodies\.min"),
         (["--tolerance", "2"], r"is the key tolerance of the table \[carving\.hull\]"),
         (["--nodes.colors", "false"], r"takes no settings of the table \[nodes\]"),
