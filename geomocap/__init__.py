@@ -18,8 +18,10 @@ from typing import TYPE_CHECKING, Any
 # Threads without work sleep instead of spinning: on a machine that does other things too, spinning makes short kernels
 # several times slower. Read when OpenMP is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-# Frames are mapped over threads that each call parallel kernels: of Numba's layers only OpenMP allows that.
-os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")
+
+from geomocap.kernel_cache import configure_numba
+
+configure_numba()
 
 try:
     __version__ = version("geomocap")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geomocap.dense import CloudFrame
+from geomocap.dense.dense_frame import CloudFrame
 from geomocap.errors import GeometryError, RunError
 from geomocap.files.atomic import write_atomic
 from geomocap.files.capture import Capture
@@ -335,7 +335,7 @@ def _separation(results: Results, stage: ViewStage | None, desk: Desk) -> list[B
     words = (
         f"The bodies come from {len(chosen)} {followed}, followed through all frames. Where a subject "
         "bends in many small steps, like a trunk or a tail, any border is arbitrary: the other numbers of bodies are "
-        "as good. --bodies sets a number, --motion_bodies.min_turn_deg the criterion."
+        "as good. --bodies sets a number, --min-turn the criterion."
     )
     blocks = desk.sheet("alternatives", separation.alternatives_sheet(results, stage), "Samples by body", words)
     if found.curve_bodies is not None and found.curve_strengths is not None and len(found.curve_bodies) > 1:

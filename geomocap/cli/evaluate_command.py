@@ -9,12 +9,13 @@ from typing import Annotated, Literal
 import typer
 from rich.table import Table
 
-from geomocap.cli.execution import Workers
+from geomocap.cli.arguments import Workers
+from geomocap.cli.console import console
 from geomocap.cli.progress_bars import progress_bars
-from geomocap.cli.reports import console
 from geomocap.cli.settings_options import with_options_of
-from geomocap.evaluation import Evaluation, EvaluationSettings
-from geomocap.evaluation import evaluate as evaluate_run
+from geomocap.evaluation.evaluation_settings import EvaluationSettings
+from geomocap.evaluation.result import Evaluation
+from geomocap.evaluation.run_evaluation import evaluate as evaluate_run
 from geomocap.files.atomic import write_text
 from viz.evaluation_report import evaluation_report
 

@@ -9,10 +9,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from geomocap.cli.execution import Workers
+from geomocap.cli.arguments import ExistingRun, Workers
+from geomocap.cli.console import console
 from geomocap.cli.export_command import report_exported
-from geomocap.cli.jobs import ExistingRun
-from geomocap.cli.reports import capture_of, console
+from geomocap.cli.reports import capture_of
 from geomocap.cli.settings_options import with_file_of_options
 from geomocap.errors import GeomocapError
 from geomocap.export.run_export import export_run

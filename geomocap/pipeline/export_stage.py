@@ -17,7 +17,7 @@ def motion_files(job: Job, source: Source) -> str:
     if not (job.run.path / "skeleton.npz").exists():
         return segmented
     beside = fingerprint(job.run.path / name for name in ("names.toml", "keypoints.npz"))
-    key = stage_key("export", segmented, job.config.export.model_dump(), job.up, beside)
+    key = stage_key(__name__, "export", segmented, job.config.export.model_dump(), job.up, beside)
 
     def work() -> int:
         written = export_run(job.run, settings=job.config.export, progress=job.progress)

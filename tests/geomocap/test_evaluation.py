@@ -6,9 +6,10 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from geomocap.evaluation import EvaluationSettings, evaluate
 from geomocap.evaluation.body_scores import adjusted_rand_index
+from geomocap.evaluation.evaluation_settings import EvaluationSettings
 from geomocap.evaluation.result import EvaluationError
+from geomocap.evaluation.run_evaluation import evaluate
 from geomocap.evaluation.surfaces import read_labelled
 from geomocap.evaluation.truth import Truth
 from geomocap.export.export_errors import MotionError

@@ -6,7 +6,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from geomocap.bodies.body_criteria import fixed_fraction, may_be_joined
-from geomocap.bodies.motion_bodies import MotionBodiesSettings, find_motion_bodies
+from geomocap.bodies.body_settings import MotionBodiesSettings
+from geomocap.bodies.motion_bodies import find_motion_bodies
 from geomocap.bodies.point_labels import label_points
 from geomocap.bodies.rigid_motions import turn_angles
 from geomocap.errors import GeometryError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geomocap.carving import Undistortion
+from geomocap.carving.silhouette_views import Undistortion
 from geomocap.evaluation.self_check import check_result
 from geomocap.model.surface import surface_through
 from geomocap.skeleton.body_observations import SkinPoints

@@ -15,7 +15,8 @@ from geomocap.skeleton.articulated_adjustment import adjust
 from geomocap.skeleton.body_observations import Observations
 from geomocap.skeleton.kinematics import BodyMotion, JointMotion, body_motion, posed, since
 from geomocap.skeleton.motion_smoothness import PosePrior
-from geomocap.subject.model_following import FollowingSettings, follow_model
+from geomocap.subject.following_settings import FollowingSettings
+from geomocap.subject.model_following import follow_model
 from geomocap.subject.pose_search import find_pose
 from geomocap.subject.sequence_paths import attach_paths, turned_by_paths
 from geomocap.subject.subject_model import SubjectModel, read_model, rotation_limits

@@ -2,7 +2,8 @@ import numpy as np
 import pygltflib
 import pytest
 
-from geomocap.bodies.motion_bodies import MotionBodiesSettings, find_motion_bodies
+from geomocap.bodies.body_settings import MotionBodiesSettings
+from geomocap.bodies.motion_bodies import find_motion_bodies
 from geomocap.errors import GeometryError
 from geomocap.export.run_export import export_run
 from geomocap.files.run import Run

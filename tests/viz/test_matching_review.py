@@ -9,7 +9,10 @@ import open3d as o3d
 import pytest
 
 from geomocap.config import load_config
-from geomocap.dense import CloudFrame, CloudSettings, cloud_of_frame, match_groups, undistorted_color
+from geomocap.dense.dense_frame import CloudFrame, cloud_of_frame
+from geomocap.dense.dense_settings import CloudSettings
+from geomocap.dense.match_groups import match_groups
+from geomocap.dense.matching_images import undistorted_color
 from geomocap.files.run import Run
 from geomocap.pipeline import Job, clouds
 from geomocap.scheduling import threads
