@@ -12,7 +12,6 @@ first, so that `import geomocap` is quick.
 
 import importlib
 import os
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 # Threads without work sleep instead of spinning: on a machine that does other things too, spinning makes short kernels
@@ -20,13 +19,9 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from geomocap.kernel_cache import configure_numba
+from geomocap.version import __version__
 
 configure_numba()
-
-try:
-    __version__ = version("geomocap")
-except PackageNotFoundError:  # a source tree that was never installed
-    __version__ = "0+unknown"
 
 if TYPE_CHECKING:
     from geomocap.carving.frames import carve

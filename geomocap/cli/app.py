@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-import geomocap
 from geomocap.cli.console import console
+from geomocap.version import __version__
 
 # name: where the command is, and what it does in the words of its own help
 COMMANDS = {
@@ -110,7 +110,7 @@ app = typer.Typer(
 
 def _version(wanted: bool) -> None:
     if wanted:
-        console.print(f"geomocap {geomocap.__version__}")
+        console.print(f"geomocap {__version__}")
         raise typer.Exit
 
 

@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-import geomocap
 from geomocap.errors import RunError
 from geomocap.files.atomic import write_text
 from geomocap.files.npz import read_npz, write_npz
 from geomocap.source_digest import module_digest
+from geomocap.version import __version__
 
 
 def stage_key(module: str, *parts: Any) -> str:
@@ -40,7 +40,7 @@ def stage_key(module: str, *parts: Any) -> str:
     *parts
         Strings, numbers, settings dumped to dicts.
     """
-    text = json.dumps([geomocap.__version__, module_digest(module), *parts], sort_keys=True, default=str)
+    text = json.dumps([__version__, module_digest(module), *parts], sort_keys=True, default=str)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
