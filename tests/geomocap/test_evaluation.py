@@ -154,7 +154,7 @@ def test_joints_against_loops(judged):
 def test_edges_and_rotations(judged):
     _, _, result = judged
     assert result.figures["skeleton.true_edges_found"] == 1
-    assert result.figures["skeleton.false_edges"] == 1  # 2–3
+    assert result.figures["skeleton.false_edges"] == 1  # 2–4
     # One body of three drifts evenly from 0° to 12°, the others are right.
     assert result.figures["motion.body_rotation_error_deg"] == pytest.approx(6 / 3, abs=1e-3)
 
@@ -183,6 +183,7 @@ def test_a_perfect_run_is_perfect(tmp_path):
     s["body_rotations"] = np.einsum("tbij,bkj->tbik", turned, turned[0])
     s["joint_positions"] = t["joint_positions"][:, [1, 2, 3]]
     s["joint_bodies"], s["joint_names"] = s["joint_bodies"][:3], s["joint_names"][:3]
+    s["body_positions"] = s["body_positions"][:, :4]
     run.write_npz("skeleton.npz", **s)
     f = evaluate(run.path, truth).figures
     assert f["joints.recall_at_5%h"] == f["joints.precision_at_10%h"] == f["skeleton.true_edges_found"] == 1
@@ -196,6 +197,7 @@ def test_one_body_recalls_no_joint(tmp_path):
     s = run.read_npz("skeleton.npz")
     s["joint_positions"], s["joint_bodies"] = s["joint_positions"][:, :0], s["joint_bodies"][:0]
     s["joint_names"], s["body_rotations"] = s["joint_names"][:0], s["body_rotations"][:, :1]
+    s["body_positions"] = s["body_positions"][:, :1]
     run.write_npz("skeleton.npz", **s)
     f = evaluate(run.path, truth).figures
     assert (f["joints.found"], f["joints.true"]) == (0, 3)
@@ -216,6 +218,7 @@ def test_a_perfect_run_of_two_roots_is_perfect(tmp_path):
     s = run.read_npz("skeleton.npz")
     s["joint_positions"], s["joint_bodies"] = t["joint_positions"][:, [1, 2]], np.array([[0, 1], [1, 2]])
     s["joint_names"] = s["joint_names"][:2]
+    s["body_rotations"], s["body_positions"] = s["body_rotations"][:, :3], s["body_positions"][:, :3]
     run.write_npz("skeleton.npz", **s)
     f = evaluate(run.path, truth).figures
     assert (f["truth.bodies"], f["joints.true"]) == (4, 2)

@@ -110,7 +110,9 @@ def test_skin_follows_the_bending_arm(arm_run):
 
 def test_another_reference_frame_binds_in_its_pose(arm_run):
     motion = motion_from_skeleton(skeleton_of(bending_arm()))
-    straight = motion_from_skeleton({k: v[::-1] if np.ndim(v) > 2 else v for k, v in bending_arm().items()})
+    straight = motion_from_skeleton(
+        skeleton_of({k: v[::-1] if np.ndim(v) > 2 else v for k, v in bending_arm().items()})
+    )
     settings = ExportSettings(skin_triangles=5000)
     for m in (motion, straight):
         mesh = skin_from_run(arm_run, m, settings)
