@@ -13,11 +13,18 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 demo: .stamps/core
 	$(BIN)/geomocap demo $(OUT)
 
+# What compiles most kernels, and what compares numbers of threads, runs by itself with all cores; then the rest runs in
+# two processes of one thread each, every file in one of them.
+ALONE := tests/test_accuracy.py tests/geomocap/test_scheduling.py tests/geomocap/test_patches_tracking.py
+SIDE_BY_SIDE := -n 2 --dist loadfile $(addprefix --ignore=,$(ALONE))
+
 test: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(ALONE)
+	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(SIDE_BY_SIDE)
 
 test-fast: .stamps/dev
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow" $(ALONE)
+	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" $(SIDE_BY_SIDE)
 
 lint: .stamps/dev
 	$(BIN)/ruff check .

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from geomocap.errors import GeomocapError
+from geomocap.model.rotations import nearest_rotation
 
 WORLD_FROM_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 """Turns glTF's axes (Y up, Z towards the viewer) into ours (Z up), (4, 4)."""
@@ -151,9 +152,7 @@ class AnimatedAsset:
             World from joint; scale and shear are taken out (the rotation nearest to the transform).
         """
         world = self.world_from_asset @ self.pose(self.clip_time(time)).asset_from_joint
-        u, _, vt = np.linalg.svd(world[:, :3, :3])
-        u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
-        return world[:, :3, 3].copy(), u @ vt
+        return world[:, :3, 3].copy(), nearest_rotation(world[:, :3, :3])
 
     def welded(self, normals: np.ndarray) -> AnimatedAsset:
         """Return the asset with vertices that lie together at rest sharing one normal, unless the file parts them.

@@ -22,6 +22,7 @@ from data_tools.video_writing import VideoFile
 from geomocap.errors import CaptureError
 from geomocap.files.atomic import write_atomic
 from geomocap.files.capture import CaptureInfo, write_capture_info
+from geomocap.files.rigs import write_rig
 from geomocap.model.rig import Rig
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads
@@ -141,9 +142,9 @@ def synthesize(
     else:
         _record(asset, vertices, times, world, surface, capture, truth, settings, executor, progress)
     write_truth(asset, times, vertices, settings, truth)
-    world.rig.write(truth / "sparse")
+    write_rig(truth / "sparse", world.rig)
     if not settings.withhold_calibration:
-        world.rig.write(capture / "sparse")
+        write_rig(capture / "sparse", world.rig)
     # The description comes last: a capture that was not finished does not open
     write_capture_info(capture, CaptureInfo(name=asset.name, fps=settings.fps, up="z", cameras=world.rig.names))
     return SynthesisResult(world.rig, world.footprint, times, tuple(notes))

@@ -14,12 +14,12 @@ from geomocap.bodies.point_labels import label_points
 from geomocap.bodies.ray_depths import find_bodies_and_depths
 from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.skeleton import Skeleton
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.nodes.node_tracking import track_nodes
 from geomocap.progress import Progress, silent
 from geomocap.settings import Settings
 from geomocap.skeleton.common_points import CommonPoint
-from geomocap.skeleton.m3_skeleton import Skeleton
 from geomocap.skeleton.motion_skeleton import MotionSkeleton, MotionSkeletonSettings, find_motion_skeleton
 from geomocap.skeleton.refinement import RefinementSettings, refine_skeleton
 from geomocap.trajectories.selection import spread_out

@@ -107,7 +107,7 @@ class Subject:
             return SceneSurface(v.points, v.colors, v.voxel_size)
         if self.results.has("cloud", frame):
             c = self.results.cloud(frame)
-            return SceneSurface(c.positions, c.colors, spacing(c.positions))
+            return SceneSurface(c.positions, c.shown_colors, spacing(c.positions))
         points = self.tracks[:, frame]
         points = points[np.isfinite(points[:, 0])]
         return SceneSurface(points, np.full(points.shape, 150, np.uint8), spacing(points))

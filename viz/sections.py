@@ -32,9 +32,9 @@ def lead(results: Results) -> str:
         source = "a sequence of geometry" if len(results.frames) > 1 else "a scan"
     e, s = results.ellipsoids, results.skeleton
     if s is not None:
-        return f"From {source} to {s.n_bodies} rigid bodies and {len(s.joint_names)} joints, without a body model."
-    if e is not None and e.n_bodies:
-        return f"From {source} to {e.n_bodies} rigid bodies, without a body model."
+        return f"From {source} to {s.body_count} rigid bodies and {len(s.joint_names)} joints, without a body model."
+    if e is not None and e.body_count:
+        return f"From {source} to {e.body_count} rigid bodies, without a body model."
     if e is not None:
         return f"From {source} to {e.centers.shape[1]} ellipsoids."
     return f"What has been made from {source} so far."
@@ -55,8 +55,8 @@ def key_figures(results: Results) -> tuple[tuple[str, str], ...]:
             figures.append((f"{round(float(results.counts[kind].mean())):,}", label))
     if results.ellipsoids is not None:
         figures.append((str(results.ellipsoids.centers.shape[1]), "ellipsoids"))
-        if results.ellipsoids.n_bodies:
-            figures.append((str(results.ellipsoids.n_bodies), "bodies"))
+        if results.ellipsoids.body_count:
+            figures.append((str(results.ellipsoids.body_count), "bodies"))
     if results.skeleton is not None:
         figures.append((str(len(results.skeleton.joint_names)), "joints"))
     timings = results.run.read_timings()
@@ -87,13 +87,13 @@ def cameras_table(results: Results) -> Block:
 
 def bodies_table(results: Results, frame: int) -> Block:
     """Return the table of bodies: their fraction of the points, ellipsoids and joints."""
-    labels = np.asarray(results.bodies(frame).bodies)
+    labels = results.bodies(frame).body
     e, s = results.ellipsoids, results.skeleton
-    count = int(max(labels.max(initial=-1), -1 if e is None else e.body.max(initial=-1))) + 1
+    count = int(max(labels.max(initial=-1), -1 if e is None else e.bodies.max(initial=-1))) + 1
     rows, colors = [], []
     for body in (*range(count), *([-1] if (labels < 0).any() else [])):
         fraction = f"{100 * float(np.mean(labels == body)):.1f}"
-        own = "" if e is None else str(int((e.body == body).sum()))
+        own = "" if e is None else str(int((e.bodies == body).sum()))
         joints = ""
         if s is not None and body >= 0:
             joints = ", ".join(s.joint_names[j] for j in np.flatnonzero((s.joint_bodies == body).any(axis=1)).tolist())

@@ -18,12 +18,11 @@ from geomocap.cli.info import info
 from geomocap.cli.jobs import CaptureFolder, ExistingRun, RunFolder, capture_job, scans_job
 from geomocap.cli.keypoint_command import keypoints
 from geomocap.cli.progress_bars import progress_bars
-from geomocap.cli.reports import capture_of, console, review_job, tell_clouds, tell_results
+from geomocap.cli.reports import capture_of, console, review_job, review_run, tell_clouds, tell_results
 from geomocap.cli.settings_options import with_file_of_options, with_settings
 from geomocap.config import Config
 from geomocap.files.run import Run
 from viz.picture_files import render_file
-from viz.review import review as review_files
 
 app = typer.Typer(
     name="geomocap",
@@ -160,7 +159,7 @@ def run(
 def review(run: ExistingRun, workers: Workers = None) -> None:
     """Make the pictures and the report of a run anew, from its files."""
     with progress_bars() as progress:
-        review_files(Run(run), capture_of(Run(run)), progress=progress)
+        review_run(Run(run), capture_of(Run(run)), progress)
     tell_results(run)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -9,9 +10,11 @@ from rich.console import Console
 from geomocap.errors import GeomocapError
 from geomocap.files.atomic import fingerprint
 from geomocap.files.capture import Capture
+from geomocap.files.results import read_cloud_record
 from geomocap.files.run import Run, stage_key
-from geomocap.pipeline.cloud_stage import read_cloud_record
+from geomocap.pipeline.cloud_stage import measure_again
 from geomocap.pipeline.job import Job
+from geomocap.progress import Progress, silent
 from viz.review import review
 
 console = Console(highlight=False, soft_wrap=True)
@@ -27,7 +30,12 @@ def review_job(job: Job, made_from: str) -> None:
     """
     code = fingerprint([Path(review.__code__.co_filename).parent])
     key = stage_key("review", made_from, job.up, code, sorted(job.run.read_timings()))
-    job.stage("review", key, ["review"], lambda: len(review(job.run, job.capture, progress=job.progress)))
+    job.stage("review", key, ["review"], lambda: len(review_run(job.run, job.capture, job.progress)))
+
+
+def review_run(run: Run, capture: Capture | None, progress: Progress = silent) -> list[Path]:
+    """Make pictures and report of a run, with a frame's surface measured again where it was measured."""
+    return review(run, capture, measured=partial(measure_again, run, capture), progress=progress)
 
 
 def capture_of(run: Run) -> Capture | None:

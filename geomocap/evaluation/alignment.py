@@ -18,6 +18,7 @@ from scipy.optimize import linear_sum_assignment, minimize_scalar
 from geomocap.evaluation.evaluation_settings import EvaluationSettings
 from geomocap.evaluation.marker_track import MarkerTrack
 from geomocap.evaluation.result import Alignment, EvaluationError
+from geomocap.model.rotations import nearest_rotation
 
 Pairs = list[tuple[int, int]]
 
@@ -125,9 +126,7 @@ def rigid_motion(source: np.ndarray, target: np.ndarray, weights: np.ndarray) ->
     """
     w = weights / weights.sum()
     a, b = w @ source, w @ target
-    u, _, vt = np.linalg.svd((source - a).T @ ((target - b) * w[:, None]))
-    sign = np.sign(np.linalg.det(vt.T @ u.T))
-    R = vt.T @ np.diag([1, 1, sign]) @ u.T
+    R = nearest_rotation(((target - b) * w[:, None]).T @ (source - a))
     return R, b - R @ a
 
 

@@ -10,6 +10,8 @@ import numpy as np
 import open3d as o3d
 
 from geomocap.evaluation.result import EvaluationError
+from geomocap.files.npz import read_npz
+from geomocap.model.rotations import relative_turns, turn_angles
 
 ACTIVE_DEG = 15.0  # a rig joint is active when its segment turns at least this much against its parent segment
 MIN_FRACTION = 0.012  # a segment with a smaller fraction of the surface (fingers, eyes) belongs to its parent's body
@@ -92,13 +94,9 @@ class Truth:
             If the file is missing, damaged, lacks arrays, or holds NaN, no frames or lengths that are no metres.
         """
         file = path / "truth.npz" if path.is_dir() else path
-        try:
-            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
-                arrays = dict(data)
-        except FileNotFoundError:
-            raise EvaluationError(f"{file}: missing; a truth is a folder with truth.npz, or a motion file") from None
-        except Exception as error:
-            raise EvaluationError(f"{file}: damaged ({error}); make it again") from None
+        if not file.is_file():
+            raise EvaluationError(f"{file}: missing; a truth is a folder with truth.npz, or a motion file")
+        arrays = read_npz(file)
         _check(arrays, file)
         weights = arrays.get("vertex_weights")
         return cls(
@@ -231,15 +229,9 @@ def _parents_first(parents: np.ndarray) -> list[int]:
 
 
 def _largest_turn_deg(rotations: np.ndarray, reference: int, joint: int) -> float:
-    relative = np.einsum("tji,tjk->tik", rotations[:, reference], rotations[:, joint])
+    relative = relative_turns(rotations[:, reference], rotations[:, joint])
     since_first = np.einsum("ij,tkj->tik", relative[0], relative)
-    return float(angles_deg(since_first).max())
-
-
-def angles_deg(rotations: np.ndarray) -> np.ndarray:
-    """Angles of rotations (..., 3, 3), degrees."""
-    cosine = (np.trace(rotations, axis1=-2, axis2=-1) - 1) / 2
-    return np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
+    return float(np.rad2deg(turn_angles(since_first)).max())
 
 
 def _check(arrays: dict[str, np.ndarray], file: Path) -> None:

@@ -25,6 +25,7 @@ from pydantic import Field, ValidationError, field_validator
 from geomocap.errors import CaptureError
 from geomocap.files.atomic import fingerprint, links, write_text
 from geomocap.files.images import IMAGE_ENDINGS, ImageFolder, read_image, size_text
+from geomocap.files.rigs import read_rig
 from geomocap.files.videos import VIDEO_ENDINGS, Video
 from geomocap.model.rig import Rig
 from geomocap.settings import Settings
@@ -259,7 +260,7 @@ class Capture:
         """
         if not self.is_calibrated:
             raise CaptureError(f"{self.path}: not calibrated, no folder sparse/; run `geomocap calibrate {self.path}`")
-        rig = Rig.read(self.path / "sparse", self.cameras)
+        rig = read_rig(self.path / "sparse", self.cameras)
         for name, (w, h) in zip(rig.names, rig.sizes, strict=True):
             size = self.sources[name].size
             if size != (w, h):

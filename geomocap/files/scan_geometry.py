@@ -10,8 +10,8 @@ import open3d as o3d
 import trimesh
 
 from geomocap.errors import GeometryError
+from geomocap.files.frame_files import read_voxels
 from geomocap.files.open3d_geometry import check_ply, read_by_open3d
-from geomocap.model.frame_geometry import Voxels
 
 MESH_ENDINGS = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 CLOUD_ENDINGS = (".ply", ".pcd", ".xyz", ".pts")
@@ -97,7 +97,7 @@ def read_surface(path: Path) -> ScanSurface:
     if suffix == ".ply":
         check_ply(path)
         if _is_voxel_grid(path):
-            return ScanSurface(Voxels.read(path).points)
+            return ScanSurface(read_voxels(path).points)
     try:
         if suffix in MESH_ENDINGS:
             mesh = trimesh.load(path, process=False, force="mesh")

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomocap.errors import GeometryError
+from geomocap.model.keypoint_paths import KeyPointPaths
+from geomocap.model.rotations import nearest_rotation
 from geomocap.model.trajectories import Trajectories
 
 REACH = 4.0
@@ -27,28 +29,6 @@ _MEMORY = 12.0  # weight of the largest misfit before in a trajectory's variance
 _ALIKE = 0.003  # m; largest shift within one frame, in the key-point's axes, of a trajectory that joins in
 _LOST = 0.5  # radii; standard deviation from which a key-point counts as lost
 _STEADY = 0.001  # m; how far points may be apart to determine a turn, against the last one
-
-
-@dataclass(frozen=True)
-class KeyPointPaths:
-    """Key-points through time.
-
-    Attributes
-    ----------
-    positions : (T, K, 3) float, metres, world
-        NaN where nothing near was measured.
-    bridged : (T, K) bool
-        Carried by the body round the point instead of the trajectories inside.
-    n_tracks : (T, K) int
-        Trajectories that it was moved by: those inside, where it is bridged those around.
-    std : (T, K) float, metres
-        Standard deviation of the place against that in the frame where it was put.
-    """
-
-    positions: np.ndarray
-    bridged: np.ndarray
-    n_tracks: np.ndarray
-    std: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -68,7 +48,7 @@ class Measured:
     def of(cls, tracks: Trajectories) -> Measured:
         """Arrange trajectories by frame; unknown precision counts as good."""
         places = np.ascontiguousarray(tracks.positions.transpose(1, 0, 2))
-        return cls(places, np.nan_to_num(np.ascontiguousarray(tracks.sigma.T) ** 2, nan=0.0) + _NOISE**2)
+        return cls(places, np.nan_to_num(np.ascontiguousarray(tracks.sigma.T, np.float64) ** 2, nan=0.0) + _NOISE**2)
 
 
 def follow_keypoints(
@@ -173,8 +153,7 @@ def _fit(local: np.ndarray, world: np.ndarray, variance: np.ndarray, last_turn: 
         if len(local) >= _LEAST:
             # the last turn steadies directions that the points hardly determine
             spread = ((world - b) * weight[:, None]).T @ (local - a) + _STEADY**2 * total * last_turn
-            U, _, Vt = np.linalg.svd(spread)
-            turn = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+            turn = nearest_rotation(spread)
         place = b - turn @ a
         miss = np.linalg.norm(world - local @ turn.T - place, axis=1)
         weight = 1 / (variance + miss**2)

@@ -34,7 +34,9 @@ class Ellipsoids:
     counts : (K,) int32
         Points that each was fitted to.
     errors : (K,) float, metres
-        Fitting error as an equivalent length, see `fitting_errors`.
+        Fitting error as an equivalent length, see `fit_ellipsoids`.
+    body : (K,) int, optional
+        Body of each ellipsoid, -1: none.
     """
 
     centers: np.ndarray
@@ -42,18 +44,41 @@ class Ellipsoids:
     rotations: np.ndarray
     counts: np.ndarray
     errors: np.ndarray
+    body: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         lead = self.counts.shape
         shapes = (self.centers.shape, self.radii.shape, self.rotations.shape, self.errors.shape)
         if shapes != ((*lead, 3), (*lead, 3), (*lead, 3, 3), lead):
             raise GeometryError(f"ellipsoids: arrays of shapes {shapes} don't belong together (counts {lead})")
+        if self.body is not None and self.body.shape != lead[-1:]:
+            raise GeometryError(f"ellipsoids: bodies of shape {self.body.shape}, expected {lead[-1:]}")
 
     def __len__(self) -> int:
         return self.counts.shape[-1]
 
+    @property
+    def frame_count(self) -> int:
+        """Number of frames T of a sequence."""
+        return len(self.counts)
+
+    @property
+    def bodies(self) -> np.ndarray:
+        """Body of each ellipsoid, (K,) int; -1: none."""
+        return np.full(len(self), -1) if self.body is None else self.body
+
+    @property
+    def body_count(self) -> int:
+        """Number of bodies that they belong to."""
+        return int(self.bodies.max(initial=-1)) + 1
+
+    @property
+    def seen_centers(self) -> np.ndarray:
+        """Centres (…, K, 3), metres, world; NaN where no points belong to an ellipsoid."""
+        return np.where(self.counts[..., None] > 0, self.centers, np.nan)
+
     @classmethod
-    def stack(cls, frames: list[Ellipsoids]) -> Ellipsoids:
+    def stack(cls, frames: list[Ellipsoids], body: np.ndarray | None = None) -> Ellipsoids:
         """Join the ellipsoids of T frames, all of the same number K, into arrays (T, K, …)."""
         return cls(
             np.stack([f.centers for f in frames]),
@@ -61,6 +86,7 @@ class Ellipsoids:
             np.stack([f.rotations for f in frames]),
             np.stack([f.counts for f in frames]),
             np.stack([f.errors for f in frames]),
+            body,
         )
 
 

@@ -6,14 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geomocap.files.results import write_diagnostics, write_ellipsoids, write_points, write_skeleton, write_warnings
 from geomocap.files.run import Run
+from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.ellipsoids import Ellipsoids, fit_ellipsoids
 from geomocap.model.frame_geometry import BodyPoints, Geometry
 from geomocap.motion import Motion, MotionSettings, find_motion
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.path_choice import motion_paths
 from geomocap.pipeline.subject_stage import make_model
-from geomocap.pipeline.warnings import write_warnings
 from geomocap.scheduling import map_items
 
 
@@ -33,18 +34,13 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     bodies, found = motion.bodies, motion.connected
     label = _Label(geometry, job.run, motion)
     fitted = list(map_items(label, range(frames), job.executor, "labels", job.progress))
-    together = {
-        name: np.stack([getattr(e, name) for e in fitted])
-        for name in ("centers", "radii", "rotations", "counts", "errors")
-    }
-    job.run.write_npz("ellipsoids.npz", **together, body=np.arange(bodies.body_count, dtype=np.int32))
-    job.run.write_npz("skeleton.npz", **found.skeleton.arrays())
+    write_ellipsoids(job.run, Ellipsoids.stack(fitted, np.arange(bodies.body_count, dtype=np.int32)))
+    write_skeleton(job.run, found.skeleton)
     warnings = [*motion.warnings, *make_model(job, geometry, motion)]
     if warnings:
         write_warnings(job.run, warnings)
-    job.run.write_npz(
-        "diagnostics.npz",
-        paths=np.array(source),
+    made = Diagnostics(
+        paths=source,
         sample_positions=bodies.positions,
         sample_body=bodies.label,
         sample_residuals=bodies.residuals,
@@ -57,6 +53,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
         curve_strengths=np.array([step.strength for step in bodies.curve]),
         alternative_labels=bodies.alternatives(),
     )
+    write_diagnostics(job.run, made)
     return frames
 
 
@@ -71,5 +68,5 @@ class _Label:
     def __call__(self, frame: int) -> Ellipsoids:
         points = self.geometry.points(frame)
         label = self.motion.label(frame, points)
-        BodyPoints(points, label).write(self.run.frame_file("bodies", frame))
+        write_points(self.run.frame_file("bodies", frame), BodyPoints(points, label))
         return fit_ellipsoids(points, label, self.motion.body_count, self.geometry.spacing)

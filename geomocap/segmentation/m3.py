@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 
 from geomocap.errors import GeometryError
-from geomocap.model.rotations import body_rotations
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items
+from geomocap.segmentation.body_rotations import body_rotations
 from geomocap.segmentation.ellipsoid_matching import EllipsoidPaths, match_frames
 from geomocap.segmentation.ellipsoid_splitting import SplitFrame, split_frame
 from geomocap.segmentation.iterations import peel_bodies

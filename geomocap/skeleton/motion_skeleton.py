@@ -11,13 +11,11 @@ from scipy.sparse.csgraph import connected_components
 
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.errors import GeometryError
-from geomocap.model.hierarchy import Hierarchy
+from geomocap.model.skeleton import Skeleton, bone_fixed_skeleton
 from geomocap.settings import Settings
 from geomocap.skeleton.articulated_motion import fit_articulated, prior_moments
-from geomocap.skeleton.bone_motion import local_rotations
 from geomocap.skeleton.borders import Border, contacts, find_borders
 from geomocap.skeleton.common_points import CommonPoint, common_point
-from geomocap.skeleton.m3_skeleton import Skeleton
 from geomocap.skeleton.spanning_tree import Connection, connect_by_cost, connection_cost
 from geomocap.skeleton.temporal_smoothing import smooth_positions, smooth_rotations
 
@@ -104,7 +102,7 @@ def find_motion_skeleton(
     moments = prior_moments(turned, moved, middle, np.array(spread), weights)
     motion = fit_articulated(moments, hierarchy, joints, turned, settings.rounds)
     centers = np.einsum("tbij,bj->tbi", motion.rotations, middle) + motion.translations
-    skeleton = skeleton_of_motion(hierarchy, joints, motion.rotations, motion.joint_positions, centers, middle, fps)
+    skeleton = bone_fixed_skeleton(hierarchy, joints, motion.rotations, motion.joint_positions, centers, middle, fps)
     return MotionSkeleton(skeleton, tuple(c.joint for c in chosen), np.array([c.cost for c in chosen]))
 
 
@@ -158,50 +156,3 @@ def possible_connections(bodies: MotionBodies, settings: MotionSkeletonSettings)
 def _reached(borders: dict[tuple[int, int], Border], count: int) -> csr_matrix:
     rows, columns = np.array(list(borders), int).reshape(-1, 2).T
     return csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-
-
-def skeleton_of_motion(
-    hierarchy: Hierarchy,
-    joints: np.ndarray,
-    rotations: np.ndarray,
-    joint_positions: np.ndarray,
-    centers: np.ndarray,
-    middle: np.ndarray,
-    fps: float,
-) -> Skeleton:
-    """Skeleton of a motion whose joints are fixed in both bodies.
-
-    Parameters
-    ----------
-    hierarchy : Hierarchy
-    joints : (J, 3) float, metres, world
-        In frame 0.
-    rotations : (T, B, 3, 3) float
-        Since frame 0, world axes.
-    joint_positions : (T, J, 3) float, metres, world
-    centers : (T, B, 3) float, metres, world
-        Of the bodies.
-    middle : (B, 3) float, metres, world
-        Of the bodies in frame 0.
-    fps : float
-    """
-    own = hierarchy.body_joints
-    anchors = np.where((own >= 0)[:, None], joints[own] if len(joints) else middle, middle)
-    offsets = joints - anchors[hierarchy.joint_bodies[:, 0]]
-    names = np.array([f"body{b:02d}" for b in range(len(middle))])
-    joint_names = np.array([f"joint_{names[p]}_{names[c]}" for p, c in hierarchy.joint_bodies], dtype=np.str_)
-    return Skeleton(
-        joint_positions,
-        hierarchy.joint_bodies,
-        joint_names,
-        names,
-        rotations,
-        centers,
-        hierarchy.root,
-        centers[:, hierarchy.root],
-        offsets,
-        middle - anchors,
-        local_rotations(rotations, hierarchy),
-        True,
-        float(fps),
-    )

@@ -9,10 +9,11 @@ from pydantic import Field
 
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.model.motion_paths import DEPTH_FRACTION, MotionPaths, sure_part, within_ray
+from geomocap.model.skeleton import bone_fixed_skeleton
 from geomocap.settings import Settings
 from geomocap.skeleton.articulated_adjustment import JointPrior, adjust
 from geomocap.skeleton.body_observations import Observations, SkinPoints
-from geomocap.skeleton.bone_motion import fit_offsets, forward_kinematics, local_rotations
+from geomocap.skeleton.bone_motion import fit_offsets, forward_kinematics
 from geomocap.skeleton.hinges import find_hinges, turn_information
 from geomocap.skeleton.kinematics import (
     BodyMotion,
@@ -23,7 +24,7 @@ from geomocap.skeleton.kinematics import (
     posed,
     since,
 )
-from geomocap.skeleton.motion_skeleton import MotionSkeleton, skeleton_of_motion
+from geomocap.skeleton.motion_skeleton import MotionSkeleton
 from geomocap.skeleton.motion_smoothness import Smoothness, typical_accelerations
 from geomocap.skeleton.skinning import candidates_near, fit_fractions
 
@@ -136,9 +137,9 @@ def refine_skeleton(
     # Bones that keep their length, their joints as near as can be to where bodies meet
     places = refined.joint_positions()
     offsets, _ = fit_offsets(linkage.hierarchy, bodies.rotations, centers[:, root], places, centers)
-    local = local_rotations(bodies.rotations, linkage.hierarchy)
+    local = linkage.hierarchy.local_rotations(bodies.rotations)
     places, _ = forward_kinematics(linkage.hierarchy, offsets, local, centers[:, root])
-    skeleton = skeleton_of_motion(
+    skeleton = bone_fixed_skeleton(
         linkage.hierarchy, places[0], bodies.rotations, places, centers, middle, found.skeleton.fps
     )
     joints = tuple(

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geomocap.errors import GeometryError
+from geomocap.errors import GeometryError, RunError
+from geomocap.files.npz import read_npz, write_npz
 from geomocap.model.hierarchy import Hierarchy
 from geomocap.skeleton.body_observations import SkinPoints
 from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, body_motion, posed
@@ -169,16 +170,17 @@ class SubjectModel:
         limits = np.minimum(low, self.joint_limits[:, 0]), np.maximum(high, self.joint_limits[:, 1])
         return replace(self, joint_limits=np.stack(limits, axis=1))
 
-    def arrays(self) -> dict[str, Any]:
-        """Return the arrays of `model.npz`."""
-        values = {name: np.asarray(getattr(self, name)) for name in self.__dataclass_fields__}
-        return {"kind": np.array(KIND), "version": np.array(VERSION), **values}
-
 
 def rotation_limits(rotations: np.ndarray) -> np.ndarray:
     """Least and largest components of rotation vectors, (J, 2, 3) radians, of rotations (T, J, 3, 3)."""
     vectors = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec().reshape(*rotations.shape[:2], 3)
     return np.stack([vectors.min(axis=0), vectors.max(axis=0)], axis=1)
+
+
+def write_model(path: Path, model: SubjectModel) -> None:
+    """Write a `model.npz`, whole or not at all."""
+    values = {f.name: np.asarray(getattr(model, f.name)) for f in fields(model)}
+    write_npz(path, {"kind": np.array(KIND), "version": np.array(VERSION), **values})
 
 
 def read_model(path: Path) -> SubjectModel:
@@ -189,14 +191,12 @@ def read_model(path: Path) -> SubjectModel:
     GeometryError
         If the file is missing, damaged, no model, or inconsistent.
     """
+    if not path.is_file():
+        raise GeometryError(f"{path}: no such model; a run by motion writes its subject's as model.npz")
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
-            arrays = dict(data)
-    except FileNotFoundError:
-        raise GeometryError(f"{path}: no such model; a run by motion writes its subject's as model.npz") from None
-    except Exception as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise GeometryError(f"{path}: can't be read as a model ({reason}); expected a run's model.npz") from None
+        arrays = read_npz(path)
+    except RunError:
+        raise GeometryError(f"{path}: can't be read as a model; expected a run's model.npz") from None
     if str(arrays.get("kind", "")) != KIND:
         raise GeometryError(f"{path}: no subject model; expected a run's model.npz")
     if arrays.get("version") != VERSION:

@@ -14,9 +14,8 @@ import numpy as np
 from pydantic import Field
 from scipy.spatial import cKDTree
 
-from geomocap.model.trajectories import REASONS, TOO_FAST, TOO_JERKY, TOO_SHORT, UNLIKE, Trajectories
+from geomocap.model.trajectories import REASONS, TOO_FAST, TOO_JERKY, TOO_SHORT, UNLIKE, PathDerivatives, Trajectories
 from geomocap.settings import Settings
-from geomocap.trajectories.smoothing import PathDerivatives
 
 _MOVING = 0.995  # fraction of all points whose speed and acceleration are certainly true
 _UNIFORM = 0.95  # fraction that certainly moves like the surface around it

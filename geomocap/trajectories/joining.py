@@ -7,6 +7,7 @@ from dataclasses import fields
 import numpy as np
 from scipy.spatial import cKDTree
 
+from geomocap.model.rotations import nearest_rotation
 from geomocap.model.trajectories import Trajectories
 
 _NEAR = 0.75  # of the typical distance of neighbours: nearer than patches are placed
@@ -85,5 +86,4 @@ def _near_pairs(tracks: Trajectories, distance: float) -> np.ndarray:
 
 def _mean_rotation(rotations: np.ndarray) -> np.ndarray:
     """Chordal mean of rotations (N, 3, 3)."""
-    u, _, vt = np.linalg.svd(rotations.sum(axis=0))
-    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return nearest_rotation(rotations.sum(axis=0))

@@ -18,6 +18,7 @@ from data_tools.solid_noise import fabric_noise, gradient_noise
 from data_tools.synthesize import SynthesisResult, SynthesisSettings, make_world, synthesize
 from geomocap.errors import CaptureError
 from geomocap.files.capture import Capture
+from geomocap.files.rigs import read_rig
 from geomocap.model.rig import Rig
 from geomocap.scheduling import threads
 
@@ -130,7 +131,7 @@ def test_capture_opens_and_knows_its_cameras(made) -> None:
     assert (capture.n_frames, capture.fps, capture.info.up) == (3, 10, "z")
     assert capture.cameras == ("cam01", "cam02", "cam03")
     np.testing.assert_allclose(capture.rig.cam_from_world, result.rig.cam_from_world, atol=1e-12)
-    np.testing.assert_allclose(Rig.read(truth / "sparse").cam_from_world, result.rig.cam_from_world, atol=1e-12)
+    np.testing.assert_allclose(read_rig(truth / "sparse").cam_from_world, result.rig.cam_from_world, atol=1e-12)
     assert all(c.model.name == "OPENCV" for c in capture.rig.cameras)
     assert len({tuple(c.params) for c in capture.rig.cameras}) == 3  # each lens its own
     assert all(capture.has_background(c) for c in capture.cameras)
@@ -295,7 +296,7 @@ def test_video_and_withheld_calibration(tmp_path: Path, made) -> None:
     synthesize(figure(), tmp_path / "c", tmp_path / "t", settings)
     filmed = Capture.open(tmp_path / "c")
     assert (filmed.n_frames, filmed.is_calibrated) == (3, False)
-    assert Rig.read(tmp_path / "t" / "sparse").names == capture.cameras
+    assert read_rig(tmp_path / "t" / "sparse").names == capture.cameras
     for t in (2, 0):
         off = filmed.frame("cam02", t).astype(int) - capture.frame("cam02", t)
         assert np.abs(off).mean() < 4  # lossy, and colours at half the resolution

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 
-from geomocap.export.file_rotations import rotation_about
 from geomocap.files.run import Run
+from geomocap.model.rotations import rotation_about
 
 PARENTS = np.array([-1, 0, 1, 0, 3])
 LENGTH, WIDTH = 0.4, 0.05

@@ -13,7 +13,7 @@ from geomocap.segmentation.m3 import segment_m3
 from geomocap.segmentation.m3_result import Segmentation
 from geomocap.segmentation.m3_settings import SegmentationSettings
 from geomocap.segmentation.skeleton_settings import SkeletonSettings
-from geomocap.skeleton.bone_motion import fit_motion, fit_offsets, forward_kinematics, local_rotations
+from geomocap.skeleton.bone_motion import fit_motion, fit_offsets, forward_kinematics
 from geomocap.skeleton.m3_skeleton import Skeleton, skeleton_m3
 from tests.geomocap.segmentation_scenes import hinged_arm
 
@@ -114,7 +114,7 @@ def test_forward_kinematics_by_hand():
     joints, world = forward_kinematics(CHAIN, offsets, local, np.array([[5.0, 0, 0]]))
     np.testing.assert_allclose(joints[0], [[5, 1, 0], [4, 1, 0], [4, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(world[0, 1], turn @ turn, atol=1e-12)
-    np.testing.assert_allclose(local_rotations(world, CHAIN), local, atol=1e-12)
+    np.testing.assert_allclose(CHAIN.local_rotations(world), local, atol=1e-12)
 
 
 def test_offsets_of_known_bones_are_recovered():
@@ -135,9 +135,9 @@ def test_wrong_rotations_are_turned_towards_the_joints():
     noisy = noise.reshape(world.shape) @ since_start
     noisy[0] = np.eye(3)
     turned, offsets, _ = fit_motion(CHAIN, noisy, root, joints, centers)
-    fitted, _ = forward_kinematics(CHAIN, offsets, local_rotations(turned, CHAIN), root)
+    fitted, _ = forward_kinematics(CHAIN, offsets, CHAIN.local_rotations(turned), root)
     before, _ = fit_offsets(CHAIN, noisy, root, joints, centers)
-    unfitted, _ = forward_kinematics(CHAIN, before, local_rotations(noisy, CHAIN), root)
+    unfitted, _ = forward_kinematics(CHAIN, before, CHAIN.local_rotations(noisy), root)
     miss = np.linalg.norm(fitted - joints, axis=-1).mean()
     assert miss < 0.6 * np.linalg.norm(unfitted - joints, axis=-1).mean()
     np.testing.assert_array_equal(turned[0], np.tile(np.eye(3), (4, 1, 1)))

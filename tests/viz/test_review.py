@@ -15,6 +15,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError, RunError
+from geomocap.files.frame_files import ply_count, read_points
 from geomocap.files.run import Run
 from tests.viz.conftest import LIMBS, Made
 from viz import render_file, review, scene
@@ -23,7 +24,7 @@ from viz.figures import joint_angles
 from viz.films import best_camera, motion_video, write_video
 from viz.quality_figures import assess, coverage, relative_paths
 from viz.report import Block, Report, Section, render_html, table, video
-from viz.results import Results, ply_count, read_points
+from viz.results import Results
 from viz.scene import stage
 from viz.sheets import overlay, path_sheet
 
@@ -148,7 +149,7 @@ def test_results_read_what_was_written(made: Made) -> None:
     assert {b for b, _, _ in results.skeleton.bones} == {0, 2, 4, 6, 8}
     assert results.counts["voxels"][0] == len(results.voxels(0).indices)
     assert ply_count(made.run.frame_file("bodies", 0)) == len(results.bodies(0).positions)
-    assert set(np.unique(results.bodies(0).bodies)) == set(range(-1, len(LIMBS)))
+    assert set(np.unique(results.bodies(0).body)) == set(range(-1, len(LIMBS)))
     turned = results.skeleton.joint_rotations()
     swing = LIMBS[2][5] * np.sin(2 * np.pi * 5 / 30)
     np.testing.assert_allclose(turned[5, 1], [np.degrees(swing), 0, 0], atol=1e-6)
@@ -322,9 +323,9 @@ def test_clouds_are_drawn_without_a_word(tmp_path: Path, capfd) -> None:
 def test_points_without_colours_or_bodies(tmp_path: Path) -> None:
     positions = np.array([[0, 0, 0], [1, 2, 3], [np.nan, 0, 0]], np.float32)
     o3d.t.io.write_point_cloud(str(tmp_path / "a.ply"), o3d.t.geometry.PointCloud(o3d.core.Tensor(positions)))
-    points = read_points(tmp_path / "a.ply")
-    assert len(points.positions) == 2 and points.colors.shape == (2, 3)
-    assert points.bodies is None and points.normals is None
+    points = read_points(tmp_path / "a.ply").finite
+    assert len(points.positions) == 2 and points.shown_colors.shape == (2, 3)
+    assert set(points.body) == {-1} and points.normals is None
 
 
 def test_joint_rotations_go_on_past_half_a_turn(made: Made) -> None:
