@@ -9,6 +9,7 @@ import tomllib
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pydantic import BaseModel
 
@@ -16,6 +17,7 @@ import geomocap
 from geomocap.cli.app import app
 from geomocap.config import Config
 from tests.benchmarks.quality import row
+from tests.geomocap.moving_chains import chain
 from tools.result_tables import ROOT, measured_now, read_table, read_tables
 from tools.results_page import results_page, with_table
 
@@ -99,6 +101,15 @@ def test_commands_that_pages_name_are_there_and_all_are_named():
 
 def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text().split()) <= 700
+
+
+def test_the_lines_of_python_in_the_readme_run_without_any_folder(tmp_path, monkeypatch, capsys):
+    lines = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    np.save(tmp_path / "tracks.npy", chain(3).positions)
+    monkeypatch.chdir(tmp_path)
+    assert len(lines) == 1 and len(lines[0].splitlines()) == 5
+    exec(lines[0], {})
+    assert capsys.readouterr().out.startswith("3 ['joint_body")
 
 
 def test_results_are_those_of_the_data():
