@@ -62,7 +62,7 @@ def _edit(run: Run, file: Path, host: str, port: int) -> None:
     from viz.keypoint_editor import KeyPointEditor
     from viz.keypoint_scene import Subject
     from viz.keypoint_session import Follower, Session
-    from viz.results import Results
+    from viz.run_contents import Results
 
     tracks = read_followed(run)
     begun = read_keypoints(file) if file.exists() else KeyPointFile()

@@ -24,7 +24,7 @@ from viz.keypoint_editor import KeyPointEditor
 from viz.keypoint_marks import BRIDGED, MEASURED, Marks, marked
 from viz.keypoint_scene import Subject, marks_of, timeline
 from viz.keypoint_session import Follower, Session
-from viz.results import Results
+from viz.run_contents import Results
 
 FRAMES = 6
 HEAD, KNEE = 1, 7  # bodies of the figure

@@ -14,7 +14,7 @@ from tests.viz.conftest import Made, make
 from viz import review
 from viz.keypoint_marks import BRIDGED, MEASURED, marks_of_run
 from viz.keypoint_plots import overlay_sheet, paths, speeds
-from viz.results import Results
+from viz.run_contents import Results
 from viz.scene import stage
 
 HEAD, HAND = 1, 3

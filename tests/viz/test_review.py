@@ -25,7 +25,7 @@ from viz.figures import joint_angles
 from viz.films import best_camera, motion_video, write_video
 from viz.quality_figures import assess, coverage, relative_paths
 from viz.report import Block, Report, Section, render_html, table, video
-from viz.results import Results
+from viz.run_contents import Results
 from viz.scene import stage
 from viz.sheets import overlay, path_sheet
 

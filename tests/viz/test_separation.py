@@ -15,7 +15,7 @@ from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.palette import body_colors
 from tests.viz.conftest import LIMBS, Made
 from viz import review
-from viz.results import Results
+from viz.run_contents import Results
 from viz.scene import stage
 from viz.separation import alternatives_sheet, joints_table
 

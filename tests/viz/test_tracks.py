@@ -12,7 +12,7 @@ from geomocap.errors import RunError
 from geomocap.files.run import Run
 from tests.viz.conftest import Made
 from viz import review
-from viz.results import Results
+from viz.run_contents import Results
 from viz.scene import stage
 from viz.track_pictures import filter_sheet, trajectory_sheet, velocity_sheet
 
