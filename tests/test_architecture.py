@@ -61,6 +61,20 @@ def test_segmentation_sees_points_only():
             assert f"import {source}" not in text and f"from {source}" not in text, f"{file} knows of {source}"
 
 
+def test_nouns_know_no_files_and_pictures_run_no_stage():
+    for folder, barred in (("geomocap/model", "geomocap.files"), ("viz", "geomocap.pipeline")):
+        for file in (ROOT / folder).rglob("*.py"):
+            assert barred not in file.read_text(), f"{file} imports {barred}"
+
+
+def test_results_are_opened_through_their_readers():
+    for folder in ("geomocap", "viz"):
+        for file in (ROOT / folder).rglob("*.py"):
+            if file.parent != ROOT / "geomocap" / "files":
+                text = file.read_text()
+                assert "np.load(" not in text and ".read_npz(" not in text and ".write_npz(" not in text, file
+
+
 def test_modules_have_names_that_say_something_and_stay_short():
     # Numba's cache watches a kernel's own file only: kernels that call each other have to stay in one
     for folder in ("geomocap", "data_tools", "viz"):
