@@ -112,6 +112,20 @@ def test_modules_and_classes_have_names_of_their_own():
     assert not _twice(name for source in SOURCES for name in source.classes)
 
 
+def test_nouns_know_no_files_and_pictures_run_no_stage():
+    for folder, barred in (("geomocap/model", "geomocap.files"), ("viz", "geomocap.pipeline")):
+        for file in (ROOT / folder).rglob("*.py"):
+            assert barred not in file.read_text(), f"{file} imports {barred}"
+
+
+def test_results_are_opened_through_their_readers():
+    for folder in ("geomocap", "viz"):
+        for file in (ROOT / folder).rglob("*.py"):
+            if file.parent != ROOT / "geomocap" / "files":
+                text = file.read_text()
+                assert "np.load(" not in text and ".read_npz(" not in text and ".write_npz(" not in text, file
+
+
 def test_modules_have_names_that_say_something_and_stay_short():
     for source in SOURCES:
         assert source.file.stem not in {"utils", "util", "helpers", "common", "misc"}, source.name

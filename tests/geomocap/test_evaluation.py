@@ -10,9 +10,9 @@ from geomocap.evaluation.body_scores import adjusted_rand_index
 from geomocap.evaluation.evaluation_settings import EvaluationSettings
 from geomocap.evaluation.result import EvaluationError
 from geomocap.evaluation.run_evaluation import evaluate
-from geomocap.evaluation.surfaces import read_labelled
 from geomocap.evaluation.truth import Truth
 from geomocap.export.export_errors import MotionError
+from geomocap.files.results import read_points
 from geomocap.files.run import Run
 from tests.geomocap.made_truth import flawed_run, truth_arrays, write_truth
 
@@ -84,7 +84,7 @@ def test_cloud_against_distances_to_triangles(judged):
     run, t, result = judged
     accuracy, completeness, counts = [], [], []
     for k in range(0, 16, 3):
-        points = read_labelled(run, "cloud", k)[0]
+        points = read_points(run.frame_file("cloud", k)).positions
         accuracy.append(cKDTree(dense_surface(t, k)[0]).query(points)[0])
         completeness.append(np.linalg.norm(points[:, None] - t["vertices"][k], axis=-1).min(axis=0))
         counts.append(len(points))
@@ -102,7 +102,8 @@ def test_bodies_against_counting(judged):
     height = np.ptp(t["vertices"][0, :, 2])
     index = []
     for k in range(0, 16, 3):
-        points, label = read_labelled(run, "bodies", k)
+        read = read_points(run.frame_file("bodies", k))
+        points, label = read.positions, read.body
         surface, owner = dense_surface(t, k)
         distance, nearest = cKDTree(surface).query(points)
         true = np.array([0, 1, 2, 3, 3])[owner[nearest]]

@@ -64,7 +64,7 @@ def test_speed_is_told_by_colour(made: Made, tracked: Run) -> None:
     found = results.tracks
     assert found is not None
     slow = velocity_sheet(results, stage(results), found, [3])
-    found.velocities[::2] *= 0.1
+    found.motion.velocities[::2] *= 0.1
     mixed = velocity_sheet(results, stage(results), found, [3])
     assert slow is not None and mixed is not None
     blue = [int(((i[:-40, :, 2].astype(int) - i[:-40, :, 0]) > 80).sum()) for i in (slow, mixed)]
