@@ -1,4 +1,4 @@
-"""What all tests fraction."""
+"""What all tests share."""
 
 from __future__ import annotations
 
