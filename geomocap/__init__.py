@@ -6,7 +6,7 @@ functions take and return values; only those that name a folder read or write fi
 first, so that `import geomocap` is quick.
 
 >>> import geomocap, numpy as np
->>> tracks = np.load("tracks.npy")                   # doctest: +SKIP
+>>> tracks = np.zeros((500, 60, 3))                  # yours: points, frames, metres; NaN where unseen
 >>> motion = geomocap.find_motion(tracks, fps=30)    # doctest: +SKIP
 """
 
