@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from geomocap.dense import CloudFrame
 from geomocap.errors import GeometryError, RunError
-from geomocap.files.atomic import write_atomic
 from geomocap.files.capture import Capture
 from geomocap.files.results import read_cloud_record
 from geomocap.files.run import Run
 from geomocap.progress import Progress, silent
 from viz import figures, keypoint_plots, separation, sheets
 from viz import track_pictures as tracks
-from viz.drawing import write_png
+from viz.desk import Desk
 from viz.films import motion_video
 from viz.keypoint_marks import marks_of_run
 from viz.matching_review import frame_sheet, template_sheet
 from viz.quality_figures import Quality, assess, relative_paths
-from viz.report import Block, Report, missing, picture, plot, table, text, video, write_report
+from viz.report import Block, Report, missing, table, text, video, write_report
 from viz.results import Results
 from viz.scene import stage as find_stage
 from viz.sections import (
@@ -46,40 +44,6 @@ _FOLLOWED = {
     "both": "nodes of a deformable surface, held by patches of the images",
     "ellipsoids": "ellipsoids",
 }
-
-
-@dataclass
-class Desk:
-    """What is being written: files in RUN/review, and their progress."""
-
-    folder: Path
-    progress: Progress
-    total: int
-    written: list[Path] = field(default_factory=list)
-    done: int = 0
-
-    def step(self) -> None:
-        """Report one more part as done."""
-        self.done += 1
-        self.progress("review", min(self.done, self.total), self.total)
-
-    def sheet(self, name: str, image: np.ndarray | None, heading: str, words: str) -> list[Block]:
-        """Write a picture as PNG and return its block; nothing if there is no picture."""
-        self.step()
-        if image is None:
-            return []
-        path = self.folder / f"{name}.png"
-        write_png(path, image)
-        self.written.append(path)
-        return [picture(image, heading, words)]
-
-    def plot(self, name: str, png: bytes, heading: str, words: str) -> list[Block]:
-        """Write a plot and return its block."""
-        self.step()
-        path = self.folder / f"{name}.png"
-        write_atomic(path, lambda p: p.write_bytes(png))
-        self.written.append(path)
-        return [plot(png, heading, words)]
 
 
 def review(
