@@ -8,7 +8,7 @@ OUT ?= demo
 export PYTHON
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test test-fast lint bench docs package clean
+.PHONY: demo test test-fast lint bench docs settings package clean
 
 demo: .stamps/core
 	$(BIN)/geomocap demo $(OUT)
@@ -42,6 +42,9 @@ docs: .stamps/dev
 # Wheel and source package, into dist/, installed and tried in a clean environment outside of this folder.
 package: .stamps/dev
 	tools/check_package.sh $(BIN)/python
+# docs/settings.md, written from the settings models
+settings: .stamps/dev
+	$(BIN)/python -m tools.settings_page
 
 # Python compiles what is used when it is used first; the tests use most of it, in many processes
 # (a few packages bring files for other versions of Python, which can't be compiled).

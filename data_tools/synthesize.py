@@ -13,7 +13,7 @@ from pydantic import Field
 
 from data_tools.asset import AnimatedAsset
 from data_tools.bar import BarRecording, record_bar
-from data_tools.camera_views import CameraView
+from data_tools.camera_views import DistortedView
 from data_tools.image_rendering import FloorShadow, PosedSubject, Stage, compose, expose, render_subject
 from data_tools.placement import make_camera, outline, place_cameras
 from data_tools.room import Light, Room
@@ -224,7 +224,7 @@ def _record(
 
     # Empty room: rendered once a camera, and photographed once
     def make_stage(c: int) -> Stage:
-        view = CameraView.of(rig, c)
+        view = DistortedView.of(rig, c)
         stage = Stage(view, world.room.render(view, light), world.room.floor_positions(view))
         plate = expose(stage.background, world.gains[c], settings.noise, (seed, 2, c))
         write_png(capture / "background" / f"{rig.names[c]}.png", plate)

@@ -6,25 +6,22 @@ functions take and return values; only those that name a folder read or write fi
 first, so that `import geomocap` is quick.
 
 >>> import geomocap, numpy as np
->>> tracks = np.load("tracks.npy")                   # doctest: +SKIP
+>>> tracks = np.zeros((500, 60, 3))                  # yours: points, frames, metres; NaN where unseen
 >>> motion = geomocap.find_motion(tracks, fps=30)    # doctest: +SKIP
 """
 
 import importlib
 import os
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 # Threads without work sleep instead of spinning: on a machine that does other things too, spinning makes short kernels
 # several times slower. Read when OpenMP is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-# Frames are mapped over threads that each call parallel kernels: of Numba's layers only OpenMP allows that.
-os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")
 
-try:
-    __version__ = version("geomocap")
-except PackageNotFoundError:  # a source tree that was never installed
-    __version__ = "0+unknown"
+from geomocap.kernel_cache import configure_numba
+from geomocap.version import __version__
+
+configure_numba()
 
 if TYPE_CHECKING:
     from geomocap.carving.frames import carve

@@ -19,7 +19,7 @@ from data_tools.asset import AnimatedAsset
 from data_tools.figure import mechanism
 from data_tools.synthesize import SynthesisSettings, synthesize, write_truth
 from geomocap.files.scan_geometry import ScanSurface, places_on
-from tests.benchmarks.creatures import doll
+from tests.benchmarks.creatures import doll, fan
 from tests.conftest import Command
 from tests.gates import Gate, largest_body, merge_bodies, split_body
 
@@ -70,6 +70,10 @@ CASES = {
     # Index 0.980 to 0.991: of its parts, the jaws have 25 points each. Joints 0.6 to 0.8 %, nearly all of it along the
     # hinges' axes. Rotations 0.004°.
     "hinges, tracks": Case(mechanism, 12.0, perfect_tracks, Gate(0.95, 2.0, 0.5, near=10)),
+    # Index 0.992, joints 2.3 %, rotations 4.3°: how round parts turn about their axes shows little without colours.
+    "soft trunk, scans": Case(partial(doll, limb_bones=0), 40.0, scans_without_order, Gate(0.95, 4.0, 8.0), 20),
+    # Index 0.95, joints 1.7 % (along the hinges' axes), rotations 0.2°; a pixel is a fortieth of the rotor.
+    "hinges, images": Case(fan, 30.0, small_images, Gate(0.9, 3.0, 1.0, near=10)),
 }
 
 
@@ -97,7 +101,10 @@ class Ran:
     gate: Gate
 
 
-@pytest.fixture(scope="module", params=CASES)
+SLOW = [name for name, case in CASES.items() if case.make is not perfect_tracks]
+
+
+@pytest.fixture(scope="module", params=[pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in CASES])
 def ran(request, geomocap, tmp_path_factory) -> Ran:
     case, folder = CASES[request.param], tmp_path_factory.mktemp("accuracy")
     return Ran(run(case, folder, geomocap), folder / "truth", case.gate)
@@ -122,8 +129,18 @@ def test_one_body_too_few_is_noticed(ran, geomocap, tmp_path):
     assert any(name.startswith("joints.recall") for name in wrong)
 
 
-@pytest.mark.xfail(strict=True, reason="the folds of soft elbows and knees are found as bodies: 12 to 15 of 11")
-def test_folds_of_soft_elbows_and_knees_are_no_bodies(geomocap, tmp_path):
-    case = Case(partial(doll, limb_bones=2), 16.0, perfect_tracks, Gate(0.97, 1.0, 0.5))
+WRONG = {
+    # The folds of soft elbows and knees become bodies: 12 or 13 of 11, core index 0.99 (three choices of the points)
+    "soft limbs, tracks": Case(partial(doll, limb_bones=2), 16.0, perfect_tracks, Gate(0.97, 1.0, 0.5)),
+    # 4 of 3 bodies; all else is right: core index 0.97, joints 0.4 %, rotations 0.2°
+    "soft trunk, images": Case(partial(doll, limb_bones=0), 40.0, small_images, Gate(0.95, 1.0, 1.0), 20),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="more bodies than there are")
+@pytest.mark.parametrize("name", WRONG)
+def test_bodies_that_are_found_wrong_today(name, geomocap, tmp_path):
+    case = WRONG[name]
     folder = run(case, tmp_path, geomocap)
     assert case.gate.broken(figures(folder, tmp_path / "truth", geomocap)) == []

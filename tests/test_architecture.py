@@ -16,9 +16,12 @@ ROOMS: dict[str, set[str]] = {
     "progress": set(),
     "settings": {"errors"},
     "scheduling": {"progress"},
+    "version": set(),
+    "source_digest": set(),
+    "kernel_cache": set(),
     # nouns, then the one room that reads and writes them
     "model": BASE,
-    "files": VALUES,
+    "files": VALUES | {"source_digest", "version"},
     # from images to geometry
     "calibration": VALUES | {"files"},
     "silhouettes": VALUES,
@@ -29,38 +32,30 @@ ROOMS: dict[str, set[str]] = {
     "trajectories": VALUES,
     "patches": VALUES | {"carving", "matching", "trajectories"},
     "nodes": VALUES,
-    "keypoints": VALUES | {"files"},
+    "keypoints": VALUES | {"files", "trajectories"},
     # from motion paths or points to bodies, joints, and the subject's model
     "segmentation": VALUES,
     "bodies": VALUES | {"trajectories"},
     "skeleton": VALUES | {"bodies", "segmentation"},
-    "subject": VALUES | {"bodies", "skeleton", "trajectories"},
+    # the default method on arrays
+    "motion": VALUES | {"bodies", "nodes", "skeleton", "trajectories"},
+    "subject": VALUES | {"bodies", "files", "skeleton", "trajectories"},
     # out of the house
-    "export": VALUES | {"files", "skeleton", "subject"},
-    "evaluation": VALUES | {"files", "export"},
+    "export": VALUES | {"files", "skeleton", "subject", "version"},
+    "evaluation": VALUES | {"carving", "files", "export", "skeleton", "subject"},
     "inspection": VALUES | {"files", "export", "evaluation"},
 }
 ROOMS["config"] = set(ROOMS)
 ROOMS["pipeline"] = set(ROOMS)
 ROOMS["geomocap"] = set(ROOMS)
 ROOMS["data_tools"] = VALUES | {"files", "silhouettes"}
-ROOMS["viz"] = VALUES | {"files", "calibration", "keypoints", "trajectories", "export", "evaluation", "inspection"}
+ROOMS["viz"] = VALUES | {"files", "calibration", "keypoints", "trajectories", "dense", "matching"}
+ROOMS["viz"] |= {"export", "evaluation", "inspection"}
 ROOMS["cli"] = set(ROOMS)
 ROOMS["__main__"] = {"cli"}
 
-KNOWN_ARROWS = {
-    ("model", "export"),
-    ("model", "files"),
-    ("files", "geomocap"),
-    ("export", "geomocap"),
-    ("pipeline", "geomocap"),
-    ("viz", "config"),
-    ("viz", "dense"),
-    ("viz", "matching"),
-    ("viz", "pipeline"),
-}
-KNOWN_CLASSES = {"CameraView", "Ellipsoids", "Skeleton"}
-KNOWN_LONG = {"viz.review"}
+KNOWN_ARROWS: set[tuple[str, str]] = {("data_tools", "geomocap"), ("viz", "geomocap")}
+KNOWN_LONG: set[str] = set()
 
 WHERE_POINTS_COME_FROM = {"geomocap.model.frame_geometry", "geomocap.model.rig", "open3d", "cv2", "pycolmap"}
 NOT_IN_THE_LIBRARY = {"typer", "rich", "dask", "distributed", "viser", "matplotlib", "jinja2", "pytest"}
@@ -79,7 +74,6 @@ def test_packages_import_only_what_the_table_allows():
 def test_known_exceptions_are_still_there():
     outside = {pair for pair in arrows(SOURCES) if pair[1] not in ROOMS[pair[0]]}
     assert outside >= KNOWN_ARROWS, "take those that are gone off the list"
-    assert _twice(name for source in SOURCES for name in source.classes) >= KNOWN_CLASSES
 
 
 def test_arrows_make_no_circle():
@@ -115,11 +109,24 @@ def test_importing_the_library_loads_no_command_line():
 def test_modules_and_classes_have_names_of_their_own():
     stems = [source.file.stem for source in SOURCES]
     assert _twice(stems) <= {"__init__", "__main__"}
-    assert _twice(name for source in SOURCES for name in source.classes) <= KNOWN_CLASSES
+    assert not _twice(name for source in SOURCES for name in source.classes)
+
+
+def test_nouns_know_no_files_and_pictures_run_no_stage():
+    for folder, barred in (("geomocap/model", "geomocap.files"), ("viz", "geomocap.pipeline")):
+        for file in (ROOT / folder).rglob("*.py"):
+            assert barred not in file.read_text(), f"{file} imports {barred}"
+
+
+def test_results_are_opened_through_their_readers():
+    for folder in ("geomocap", "viz"):
+        for file in (ROOT / folder).rglob("*.py"):
+            if file.parent != ROOT / "geomocap" / "files":
+                text = file.read_text()
+                assert "np.load(" not in text and ".read_npz(" not in text and ".write_npz(" not in text, file
 
 
 def test_modules_have_names_that_say_something_and_stay_short():
-    # Numba's cache watches a kernel's own file only: kernels that call each other have to stay in one
     for source in SOURCES:
         assert source.file.stem not in {"utils", "util", "helpers", "common", "misc"}, source.name
         limit = 500 if "kernel" in source.file.stem else 400

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from geomocap.evaluation import Curve, Evaluation
 from geomocap.evaluation.body_scores import LabelledFrame, labelled_frame
+from geomocap.evaluation.result import Curve, Evaluation
 from geomocap.evaluation.truth import Truth
 from geomocap.files.results import SKELETON, read_points, read_skeleton
 from geomocap.files.run import Run

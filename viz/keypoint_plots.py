@@ -13,7 +13,7 @@ from viz.body_colors import INK, body_color, hex_color
 from viz.drawing import resize, sheet
 from viz.figures import WIDTH, figure_of, plot, times_axis
 from viz.keypoint_marks import Marks, marked
-from viz.results import Results
+from viz.run_contents import Results
 from viz.viewpoints import ViewStage
 
 _STICKS = 12  # frames whose links are drawn

@@ -15,7 +15,7 @@ from geomocap.keypoints.keypoint_regions import KeyPointFile
 from viz.body_colors import hex_color
 from viz.drawing import resize
 from viz.keypoint_marks import BRIDGED, LOST, MEASURED, Marks, marked
-from viz.results import Results
+from viz.run_contents import Results
 from viz.scene import stage as find_stage
 from viz.viewpoints import ViewStage
 from viz.volumes import smooth_normals, spacing

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from geomocap.dense import CloudFrame, TemplateCloud
+from geomocap.dense.dense_frame import CloudFrame, TemplateCloud
 from geomocap.matching.growing import SurfaceMatches
 from viz.body_colors import ACCENT, INK, body_color
 from viz.drawing import faded, sheet, text_width, write_on

@@ -14,7 +14,7 @@ from geomocap.model.skeleton import Skeleton
 from geomocap.scheduling import map_items, threads
 from viz import scene
 from viz.rendering import Look, Model
-from viz.results import Results
+from viz.run_contents import Results
 from viz.viewpoints import camera_view
 
 

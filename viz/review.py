@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from geomocap.dense import CloudFrame
+from geomocap.dense.dense_frame import CloudFrame
 from geomocap.errors import GeometryError, RunError
-from geomocap.files.atomic import write_atomic
 from geomocap.files.capture import Capture
 from geomocap.files.results import read_cloud_record
 from geomocap.files.run import Run
 from geomocap.progress import Progress, silent
 from viz import figures, keypoint_plots, separation, sheets
 from viz import track_pictures as tracks
-from viz.drawing import write_png
+from viz.desk import Desk
 from viz.films import motion_video
 from viz.keypoint_marks import marks_of_run
 from viz.matching_review import frame_sheet, template_sheet
 from viz.quality_figures import Quality, assess, relative_paths
-from viz.report import Block, Report, missing, picture, plot, table, text, video, write_report
-from viz.results import Results
+from viz.report import Block, Report, missing, table, text, video, write_report
+from viz.run_contents import Results
 from viz.scene import stage as find_stage
 from viz.sections import (
     bodies_table,
@@ -36,6 +34,7 @@ from viz.sections import (
     summary,
     timings_table,
     title,
+    verdict,
 )
 from viz.viewpoints import ViewStage
 
@@ -46,40 +45,6 @@ _FOLLOWED = {
     "both": "nodes of a deformable surface, held by patches of the images",
     "ellipsoids": "ellipsoids",
 }
-
-
-@dataclass
-class Desk:
-    """What is being written: files in RUN/review, and their progress."""
-
-    folder: Path
-    progress: Progress
-    total: int
-    written: list[Path] = field(default_factory=list)
-    done: int = 0
-
-    def step(self) -> None:
-        """Report one more part as done."""
-        self.done += 1
-        self.progress("review", min(self.done, self.total), self.total)
-
-    def sheet(self, name: str, image: np.ndarray | None, heading: str, words: str) -> list[Block]:
-        """Write a picture as PNG and return its block; nothing if there is no picture."""
-        self.step()
-        if image is None:
-            return []
-        path = self.folder / f"{name}.png"
-        write_png(path, image)
-        self.written.append(path)
-        return [picture(image, heading, words)]
-
-    def plot(self, name: str, png: bytes, heading: str, words: str) -> list[Block]:
-        """Write a plot and return its block."""
-        self.step()
-        path = self.folder / f"{name}.png"
-        write_atomic(path, lambda p: p.write_bytes(png))
-        self.written.append(path)
-        return [plot(png, heading, words)]
 
 
 def review(
@@ -138,7 +103,7 @@ def review(
     quality = assess(results, chosen)
     desk.step()
     parts = [
-        section("Result", [*summary(quality), *_result(results, stage, chosen, desk)]),
+        section("Result", [*verdict(results), *summary(quality), *_result(results, stage, chosen, desk)]),
         section("What went in", _inputs(results, stage, chosen, desk)),
         section("Silhouettes", _silhouettes(results, quality, chosen, desk)),
         section("Volume and points", _volume(results, stage, chosen, desk)),
@@ -335,7 +300,7 @@ def _separation(results: Results, stage: ViewStage | None, desk: Desk) -> list[B
     words = (
         f"The bodies come from {len(chosen)} {followed}, followed through all frames. Where a subject "
         "bends in many small steps, like a trunk or a tail, any border is arbitrary: the other numbers of bodies are "
-        "as good. --bodies sets a number, --motion_bodies.min_turn_deg the criterion."
+        "as good. --bodies sets a number, --min-turn the criterion."
     )
     blocks = desk.sheet("alternatives", separation.alternatives_sheet(results, stage), "Samples by body", words)
     if found.curve_bodies is not None and found.curve_strengths is not None and len(found.curve_bodies) > 1:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from viz import body_colors as palette
-from viz.results import Results
+from viz.run_contents import Results
 from viz.shapes import EMPTY, Mesh, ball, bone, ellipsoid, join, tube
 from viz.viewpoints import ViewStage, stage_of, up_vector
 from viz.volumes import cubes, gems, skin, spacing

@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 import tomli_w
 
+from geomocap.files.check_file import read_self_check
+from geomocap.files.results import read_warnings
 from viz.body_colors import body_color, hex_color
 from viz.quality_figures import Quality
 from viz.report import Block, Section, missing, table, text
-from viz.results import Results
+from viz.run_contents import Results
 
 
 def section(title: str, blocks: list[Block]) -> Section:
@@ -111,6 +113,35 @@ def summary(quality: Quality) -> list[Block]:
     return [text(f"{remarks} on the quality of this run: see the section Quality before you use it.")]
 
 
+def verdict(results: Results) -> list[Block]:
+    """Return what to do with the result, in plain words, from how well it agrees with its own silhouettes."""
+    found = read_self_check(results.run)
+    if found is None:
+        return []
+    word, reasons = found.verdict(tuple(read_warnings(results.run)))
+    words = f"Verdict: {word}."
+    if reasons:
+        return [Block("warnings", items=(words, *reasons))]
+    return [Block("fine", f"{words} Model, cameras and paths agree.")]
+
+
+def agreement_table(results: Results) -> list[Block]:
+    """Return how well the model and the other cameras explain what each camera saw."""
+    found = read_self_check(results.run)
+    if found is None:
+        return []
+    rows = []
+    for name, model, others in zip(found.cameras, found.model, found.left_out, strict=True):
+        rows.append((name, *(_percent(float(np.nanmean(v))) if np.isfinite(v).any() else "–" for v in (model, others))))
+    head = ("camera", "model drawn (%)", "hull of the other cameras (%)")
+    words = (
+        "Intersection over union with the camera's silhouette. The model is drawn in the pose that was found: wrong "
+        "bodies put limbs where no silhouette is. The hull of the others is larger than the subject, the more so the "
+        "fewer cameras there are; a camera that stands out contradicts the others."
+    )
+    return [Block("heading", "Agreement with the cameras"), table(head, rows, (1, 2)), text(words)]
+
+
 def figures_of_quality(results: Results, quality: Quality) -> list[Block]:
     """Return warnings in words and the tables of what can be judged without ground truth."""
     blocks: list[Block] = []
@@ -154,6 +185,7 @@ def figures_of_quality(results: Results, quality: Quality) -> list[Block]:
                     "weighs more the thinner the subject."
                 )
             )
+    blocks += agreement_table(results)
     if quality.bones:
         rows = [
             (b.name, f"{1000 * b.mean:.0f}", f"{1000 * b.spread:.1f}", f"{100 * b.spread / b.mean:.1f}")

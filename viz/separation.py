@@ -13,7 +13,7 @@ from viz.drawing import sheet
 from viz.figures import WIDTH, figure_of, plot
 from viz.rendering import Model
 from viz.report import Block, table
-from viz.results import Results
+from viz.run_contents import Results
 from viz.sheets import VIEWS, picture, tile_size
 from viz.viewpoints import ViewStage
 from viz.volumes import gems, spacing

@@ -12,7 +12,7 @@ import numpy as np
 from geomocap.model.trajectories import Tracks
 from viz.body_colors import ACCENT, INK
 from viz.drawing import faded, resize, sheet, write_on
-from viz.results import Results
+from viz.run_contents import Results
 from viz.viewpoints import View, ViewStage, camera_view
 
 REMOVED = (200, 30, 50)

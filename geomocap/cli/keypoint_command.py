@@ -9,10 +9,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from geomocap.cli.execution import Workers
+from geomocap.cli.arguments import ExistingRun, Workers
+from geomocap.cli.console import console
 from geomocap.cli.export_command import report_exported
-from geomocap.cli.jobs import ExistingRun
-from geomocap.cli.reports import capture_of, console
+from geomocap.cli.reports import capture_of
 from geomocap.cli.settings_options import with_file_of_options
 from geomocap.errors import GeomocapError
 from geomocap.export.run_export import export_run
@@ -62,7 +62,7 @@ def _edit(run: Run, file: Path, host: str, port: int) -> None:
     from viz.keypoint_editor import KeyPointEditor
     from viz.keypoint_scene import Subject
     from viz.keypoint_session import Follower, Session
-    from viz.results import Results
+    from viz.run_contents import Results
 
     tracks = read_followed(run)
     begun = read_keypoints(file) if file.exists() else KeyPointFile()

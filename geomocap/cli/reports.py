@@ -5,8 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from rich.console import Console
-
+from geomocap.cli.console import console
 from geomocap.errors import GeomocapError
 from geomocap.files.atomic import fingerprint
 from geomocap.files.capture import Capture
@@ -17,8 +16,6 @@ from geomocap.pipeline.job import Job
 from geomocap.progress import Progress, silent
 from viz.review import review
 
-console = Console(highlight=False, soft_wrap=True)
-
 
 def review_job(job: Job, made_from: str) -> None:
     """Make the report of a job, unless it has been made from the same results.
@@ -28,8 +25,8 @@ def review_job(job: Job, made_from: str) -> None:
     made_from : str
         Key of the last stage that the report shows.
     """
-    code = fingerprint([Path(review.__code__.co_filename).parent])
-    key = stage_key("review", made_from, job.up, code, sorted(job.run.read_timings()))
+    templates = fingerprint([Path(review.__code__.co_filename).parent / "templates"])
+    key = stage_key(review.__module__, "review", made_from, job.up, templates, sorted(job.run.read_timings()))
     job.stage("review", key, ["review"], lambda: len(review_run(job.run, job.capture, job.progress)))
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 
+from geomocap.errors import RunError
 from geomocap.evaluation.result import EvaluationError
 from geomocap.files.npz import read_npz
 from geomocap.model.rotations import relative_turns, turn_angles
@@ -96,7 +97,10 @@ class Truth:
         file = path / "truth.npz" if path.is_dir() else path
         if not file.is_file():
             raise EvaluationError(f"{file}: missing; a truth is a folder with truth.npz, or a motion file")
-        arrays = read_npz(file)
+        try:
+            arrays = read_npz(file)
+        except RunError:
+            raise EvaluationError(f"{file}: damaged; make it again") from None
         _check(arrays, file)
         weights = arrays.get("vertex_weights")
         return cls(

@@ -32,7 +32,7 @@ def skin_from_model(model: SubjectModel, motion: MotionTree, settings: ExportSet
     found = int(motion.bodies.max()) + 1
     if found != model.body_count:
         raise MotionError(
-            f"skin: model.npz has {model.body_count} bodies, skeleton.npz {found}; run again, or --export.surface bones"
+            f"skin: model.npz has {model.body_count} bodies, skeleton.npz {found}; run again, or --surface bones"
         )
     mesh = model_mesh(model, settings.skin_triangles)
     surface, skin = mesh.surface, mesh.skin

@@ -1,6 +1,6 @@
 """A run: the output folder, written whole file by whole file, that knows which of its stages are up to date.
 
-Every stage has a key, the digest of all its inputs, its settings and the code's version. The keys are kept in
+Every stage has a key, the digest of all its inputs, its settings and the code that it uses. The keys are kept in
 `RUN/.stages/`. A stage whose key has changed is cleared before it writes; one whose key is the same goes on from the
 files that are there.
 """
@@ -16,31 +16,31 @@ import tomllib
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tomli_w
 
-import geomocap
 from geomocap.errors import RunError
 from geomocap.files.atomic import write_text
 from geomocap.files.npz import read_npz, write_npz
+from geomocap.source_digest import module_digest
+from geomocap.version import __version__
 
 
-@cache
-def code_version() -> str:
-    """The package's version with a digest of its sources, so that changed code never reuses old results."""
-    digest = hashlib.blake2b(digest_size=8)
-    for file in sorted(Path(geomocap.__file__).parent.rglob("*.py")):
-        digest.update(file.read_bytes())
-    return f"{geomocap.__version__}+{digest.hexdigest()}"
+def stage_key(module: str, *parts: Any) -> str:
+    """Digest of all that a stage's results depend on: its code, its inputs and its settings.
 
-
-def stage_key(*parts: Any) -> str:
-    """Digest of whatever a stage depends on (strings, numbers, settings dumped to dicts) and the code's version."""
-    text = json.dumps([code_version(), *parts], sort_keys=True, default=str)
+    Parameters
+    ----------
+    module : str
+        The stage's module, `__name__` there: what this module and those that it imports do is part of the key, comments
+        and docstrings are not.
+    *parts
+        Strings, numbers, settings dumped to dicts.
+    """
+    text = json.dumps([__version__, module_digest(module), *parts], sort_keys=True, default=str)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 

@@ -8,8 +8,12 @@ from typing import Literal
 import numba
 import numpy as np
 
+from geomocap.carving.carving_settings import ENCLOSING
 from geomocap.config import load_config
-from geomocap.dense import CloudFrame, CloudSettings, MatchGroups, cloud_of_frame, match_groups, undistorted_color
+from geomocap.dense.dense_frame import CloudFrame, cloud_of_frame
+from geomocap.dense.dense_settings import CloudSettings
+from geomocap.dense.match_groups import MatchGroups, match_groups
+from geomocap.dense.matching_images import undistorted_color
 from geomocap.errors import CaptureError, GeometryError, GeomocapError
 from geomocap.files.capture import Capture
 from geomocap.files.results import read_silhouette, read_voxels, write_cloud_record, write_points
@@ -19,7 +23,6 @@ from geomocap.pipeline.silhouette_stage import silhouettes
 from geomocap.pipeline.voxel_stage import voxels
 from geomocap.scheduling import map_items
 
-HULL_CAMERAS = 4  # fewer cameras don't enclose the subject: their hull bounds nothing
 BACKGROUND_FRAMES = 10  # fewer frames without a background picture don't show what moves
 
 Bounds = Literal["hull", "silhouettes", "none"]
@@ -35,7 +38,7 @@ def clouds(job: Job) -> str:
     bounds = bounds_of(capture, settings)
     before = {"hull": voxels, "silhouettes": silhouettes, "none": lambda _: ""}[bounds](job)
     pictures = capture.fingerprint("images", "videos", "sparse")
-    key = stage_key("cloud", bounds, before, pictures, settings.model_dump(), capture.info.region_of_interest)
+    key = stage_key(__name__, "cloud", bounds, before, pictures, settings.model_dump(), capture.info.region_of_interest)
 
     def work() -> int:
         missing = [k for k in range(capture.n_frames) if not job.run.frame_file("cloud", k).exists()]
@@ -66,7 +69,7 @@ def bounds_of(capture: Capture, settings: CloudSettings) -> Bounds:
     plates = all(capture.has_background(c) for c in capture.cameras)
     if not (capture.has_masks or plates or capture.n_recorded >= BACKGROUND_FRAMES):
         return "none"
-    return "hull" if len(capture.cameras) >= HULL_CAMERAS else "silhouettes"
+    return "hull" if len(capture.cameras) >= ENCLOSING else "silhouettes"
 
 
 @dataclass(frozen=True)

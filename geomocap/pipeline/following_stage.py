@@ -42,6 +42,7 @@ def segment_with_model(job: Job, geometry: Geometry, source_key: str) -> str:
     if job.capture is not None and wanted != "nodes":
         patches = tracks(job)
     key = stage_key(
+        __name__,
         "take",
         source_key,
         patches,

@@ -39,7 +39,7 @@ def segment(job: Job, source: Source) -> str:
     outputs, optional = ["ellipsoids.npz", "bodies", "diagnostics.npz"], [MODEL_FILE, WARNINGS, *FROM_BODIES]
     # a single frame has no motion to tell bodies and joints by
     (outputs if len(geometry) > 1 else optional).append("skeleton.npz")
-    key = stage_key("segmentation", source_key, tracks(job) if has_tracks else None, settings, job.fps)
+    key = stage_key(__name__, "segmentation", source_key, tracks(job) if has_tracks else None, settings, job.fps)
     work = partial(segment_by_motion, has_tracks=has_tracks) if by_motion else segment_as_m3
     return job.stage("segmentation", key, outputs, lambda: work(job, geometry), optional)
 

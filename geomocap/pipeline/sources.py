@@ -81,7 +81,7 @@ def geometry_of(job: Job, source: Source) -> tuple[Geometry, str]:
         if job.scans is None:
             raise GeometryError("no scans were given")
         settings = job.config.scans.model_dump(exclude={"up"})  # the points are the same
-        return job.scans, stage_key("scans", job.scans.fingerprint(), settings)
+        return job.scans, stage_key(__name__, "scans", job.scans.fingerprint(), settings)
     key = voxels(job) if source == "voxels" else clouds(job)
     assert job.capture is not None
     frames = job.capture.n_frames

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from geomocap.carving.carving_settings import ENCLOSING
 from geomocap.carving.silhouette_views import Undistortion
 from geomocap.errors import CaptureError
 from geomocap.files.capture import Capture
@@ -20,7 +21,7 @@ from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.patches.patch_tracking import track_surface
 from geomocap.patches.seeding import image_reduction
-from geomocap.pipeline.cloud_stage import HULL_CAMERAS, clouds
+from geomocap.pipeline.cloud_stage import clouds
 from geomocap.pipeline.derived import KEYPOINT_FILES
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.voxel_stage import voxels
@@ -43,7 +44,7 @@ def tracks(job: Job) -> str:
     tables = ("tracking", "filters", "smoothing")
     settings = {name: getattr(job.config, name).model_dump() for name in tables}
     surface = voxels(job) if _has_hull(capture) else clouds(job)
-    key = stage_key("tracks", surface, pictures, settings, job.fps)
+    key = stage_key(__name__, "tracks", surface, pictures, settings, job.fps)
     job.write_record(*tables)
     return job.stage("tracks", key, ["tracks.npz"], lambda: _track(job, capture), KEYPOINT_FILES)
 
@@ -71,7 +72,7 @@ def frame_reader(capture: Capture, run: Run, settings: TrackingSettings) -> Call
 
 
 def _has_hull(capture: Capture) -> bool:
-    return len(capture.rig) >= HULL_CAMERAS
+    return len(capture.rig) >= ENCLOSING
 
 
 def surface_voxels(points: np.ndarray, size: float) -> Voxels:

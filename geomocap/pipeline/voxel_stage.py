@@ -32,7 +32,7 @@ def voxels(job: Job) -> str:
     settings = carving_settings(job, capture)
     _ = capture.rig  # what is wrong with the calibration is said before long work begins
     key = stage_key(
-        "voxels", silhouettes(job), capture.fingerprint("images", "videos", "sparse"), settings.model_dump()
+        __name__, "voxels", silhouettes(job), capture.fingerprint("images", "videos", "sparse"), settings.model_dump()
     )
     job.write_record("carving")
     return job.stage("voxels", key, ["voxels"], lambda: _carve_all(job, capture, settings))

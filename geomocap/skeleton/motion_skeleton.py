@@ -5,48 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import Field
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.errors import GeometryError
 from geomocap.model.skeleton import Skeleton, bone_fixed_skeleton
-from geomocap.settings import Settings
 from geomocap.skeleton.articulated_motion import fit_articulated, prior_moments
 from geomocap.skeleton.borders import Border, contacts, find_borders
 from geomocap.skeleton.common_points import CommonPoint, common_point
+from geomocap.skeleton.motion_skeleton_settings import MotionSkeletonSettings
 from geomocap.skeleton.spanning_tree import Connection, connect_by_cost, connection_cost
 from geomocap.skeleton.temporal_smoothing import smooth_positions, smooth_rotations
 
 _UNSEEN = 0.05
 _BRIDGE = 1e-3
 _LEAST_MISS = 5e-4  # diagonals
-
-
-class MotionSkeletonSettings(Settings):
-    """How joints are found between bodies, and how these are connected."""
-
-    interface_prior: float = Field(
-        default=0.005,
-        gt=0,
-        description="least weight of the place where bodies touch (frames in which they turn by a radian)",
-    )
-    hinge_fraction: float = Field(
-        default=0.1, ge=0, lt=1, description="hinge: turns about other axes are less than this fraction of all (0..1)"
-    )
-    interface_weight: float = Field(
-        default=0.05, ge=0, description="tree: weight of a joint's distance from where its bodies touch (no unit)"
-    )
-    gap_weight: float = Field(default=0.05, ge=0, description="tree: weight of the bodies' distance (no unit)")
-    contact_weight: float = Field(
-        default=0.01, ge=0, description="tree: cost of bodies without common border (diagonals)"
-    )
-    largest_gap: float = Field(default=0.1, gt=0, description="bodies farther apart are not connected (diagonals)")
-    smoothing: float = Field(
-        default=0.0, ge=0, description="weight of an even pace against the samples; 1 halves what changes in 3 frames"
-    )
-    rounds: int = Field(default=6, ge=1, description="rounds of the fit that keeps joints together")
 
 
 @dataclass(frozen=True)

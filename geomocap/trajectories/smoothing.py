@@ -12,20 +12,12 @@ a millimetre, its velocities were wrong by 0.045 m/s RMS, the cubic's by 0.026 (
 from __future__ import annotations
 
 import numpy as np
-from pydantic import Field
 
 from geomocap.errors import GeometryError
 from geomocap.model.trajectories import PathDerivatives
-from geomocap.settings import Settings
+from geomocap.trajectories.trajectory_settings import SmoothingSettings
 
 _REGULAR = 1e-9
-
-
-class SmoothingSettings(Settings):
-    """How velocities and accelerations are estimated."""
-
-    half_width: int = Field(3, ge=1, description="Frames on each side that a velocity is estimated from")
-    degree: int = Field(3, ge=1, le=4, description="Degree of the polynomial in time")
 
 
 def smooth_motion(

@@ -19,7 +19,8 @@ from geomocap.carving.carving_settings import CarvingSettings
 from geomocap.carving.frames import carve_frame
 from geomocap.carving.silhouette_views import Undistortion
 from geomocap.carving.volume import working_volume
-from geomocap.dense import CloudFrame, cloud_of_frame, match_groups
+from geomocap.dense.dense_frame import CloudFrame, cloud_of_frame
+from geomocap.dense.match_groups import match_groups
 from geomocap.files.images import read_image
 from geomocap.files.rigs import read_rig
 from geomocap.matching.lsm import match_pairs

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from data_tools.bar import BarRecording, picture_bar
-from data_tools.camera_views import CameraView, look_at
+from data_tools.camera_views import DistortedView, look_at
 from data_tools.figure import figure
 from data_tools.image_rendering import PosedSubject, candidate_pixels, render_subject
 from data_tools.placement import make_camera
@@ -48,7 +48,7 @@ def digest(folder: Path) -> dict[str, str]:
 def test_rays_of_a_pixel_are_centred_on_it() -> None:
     camera = make_camera(320, 240, 60, 2.0, np.random.default_rng(0))
     rig = Rig(("a",), (camera,), look_at(np.array([3.0, 1, 2]), np.zeros(3))[None])
-    view = CameraView.of(rig, 0)
+    view = DistortedView.of(rig, 0)
     pixels = np.array([0, 319, 120 * 320 + 160, 239 * 320])
     for samples in (1, 2, 4):
         rays = view.rays(pixels, samples).astype(np.float64)
@@ -67,7 +67,7 @@ def test_candidate_pixels_hold_all_that_is_hit() -> None:
     surface = ShadedSurface.of(figure(), world.footprint, 0.28, 0)
     subject = PosedSubject.of(surface, vertices)
     for c in range(len(world.rig)):
-        view = CameraView.of(world.rig, c)
+        view = DistortedView.of(world.rig, c)
         everything = np.arange(160 * 120)
         rays = view.rays(everything, 4).reshape(-1, 6)
         import open3d as o3d
@@ -224,7 +224,7 @@ def test_centroids_of_targets_are_their_centres(size: tuple[int, int], monkeypat
     dark = np.zeros((size[1], size[0], 3), np.float32)
     errors = []
     for c in range(len(world.rig)):
-        view = CameraView.of(world.rig, c)
+        view = DistortedView.of(world.rig, c)
         for pair in bar.targets:
             image = picture_bar(dark, view, world.rig, c, pair, bar.radius)[:, :, 0]
             both = world.rig.project(pair)[c]

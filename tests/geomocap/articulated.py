@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from geomocap.model.ellipsoids import Ellipsoids
 from geomocap.model.skeleton import Skeleton, body_names
 
 
@@ -75,3 +78,25 @@ def skeleton_of(arrays: dict[str, np.ndarray]) -> Skeleton:
 def articulated_skeleton(n_bodies: int = 7, n_frames: int = 20, **how) -> Skeleton:
     """A made-up skeleton; the arguments are those of `skeleton_arrays`."""
     return skeleton_of(skeleton_arrays(n_bodies, n_frames, **how))
+
+
+def shells_at(
+    centers: np.ndarray, body: list[int], counts: np.ndarray | None = None, radius: float = 0.1
+) -> Ellipsoids:
+    """Balls with centres (T, K, 3)."""
+    lead = centers.shape[:2]
+    counts = np.full(lead, 30) if counts is None else counts
+    turns = np.tile(np.eye(3), (*lead, 1, 1))
+    return Ellipsoids(centers, np.full(centers.shape, radius), turns, counts, np.zeros(lead), np.array(body))
+
+
+def alike(one, other):
+    """Whether two values hold the same in all their fields."""
+    for f in fields(one):
+        a, b = getattr(one, f.name), getattr(other, f.name)
+        if hasattr(a, "__dataclass_fields__"):
+            alike(a, b)
+        elif a is None:
+            assert b is None
+        else:
+            np.testing.assert_array_equal(a, b, err_msg=f.name)

@@ -3,11 +3,12 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from geomocap.evaluation import EvaluationSettings, evaluate
 from geomocap.evaluation.alignment import rigid_motion
+from geomocap.evaluation.evaluation_settings import EvaluationSettings
 from geomocap.evaluation.marker_track import MarkerTrack
 from geomocap.evaluation.other_system import compare_markers, match_by_distance, read_matches
 from geomocap.evaluation.result import EvaluationError
+from geomocap.evaluation.run_evaluation import evaluate
 from geomocap.export.bvh import write_bvh
 from geomocap.export.markers import Markers
 from geomocap.export.skeleton_motion import motion_from_skeleton

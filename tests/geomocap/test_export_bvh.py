@@ -9,7 +9,7 @@ from geomocap.export.export_errors import MotionError
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from tests.geomocap.articulated import articulated_skeleton, skeleton_arrays, skeleton_of
 
-KINDS = [{}, {"roots": 2}, {"jump_mm": 15.0}, {"wander_mm": 10.0}]
+KINDS = [{}, {"jump_mm": 15.0}, {"wander_mm": 10.0}]
 
 
 def joints_of(back, motion, convention=BVH):

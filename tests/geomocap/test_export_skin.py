@@ -3,6 +3,7 @@ import open3d as o3d
 import pytest
 from scipy.spatial import cKDTree
 
+from geomocap.errors import GeometryError
 from geomocap.export.export_errors import MotionError
 from geomocap.export.export_settings import ExportSettings
 from geomocap.export.skeleton_motion import motion_from_skeleton
@@ -109,7 +110,9 @@ def test_skin_follows_the_bending_arm(arm_run):
 
 def test_another_reference_frame_binds_in_its_pose(arm_run):
     motion = motion_from_skeleton(skeleton_of(bending_arm()))
-    straight = motion_from_skeleton({k: v[::-1] if np.ndim(v) > 2 else v for k, v in bending_arm().items()})
+    straight = motion_from_skeleton(
+        skeleton_of({k: v[::-1] if np.ndim(v) > 2 else v for k, v in bending_arm().items()})
+    )
     settings = ExportSettings(skin_triangles=5000)
     for m in (motion, straight):
         mesh = skin_from_run(arm_run, m, settings)
@@ -149,9 +152,9 @@ def test_frames_and_points_that_make_no_skin(arm_run):
         skin_from_run(arm_run, motion, ExportSettings(skin_frame=5))
     with pytest.raises(MotionError, match="no colours there"):
         skin_from_run(arm_run, motion, ExportSettings(skin_colors="true"))
-    with pytest.raises(MotionError, match="3 points are too few"):
+    with pytest.raises(GeometryError, match="3 points are too few"):
         surface_through(np.eye(3))
-    with pytest.raises(MotionError, match="all points lie in one place"):
+    with pytest.raises(GeometryError, match="all points lie in one place"):
         point_spacing(np.zeros((60, 3)))
     with pytest.raises(MotionError, match="body 7 has points but no place"):
         node_of_body(motion, np.array([0, 1, 7]))

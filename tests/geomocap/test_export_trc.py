@@ -6,7 +6,8 @@ import pytest
 from geomocap.export.export_errors import MotionError
 from geomocap.export.markers import Markers, markers_from_run
 from geomocap.export.trc import read_trc, write_trc
-from tests.geomocap.articulated import articulated_skeleton, skeleton_arrays, skeleton_of
+from geomocap.model.keypoint_paths import KeyPointPaths, KeyPoints
+from tests.geomocap.articulated import articulated_skeleton, shells_at, skeleton_arrays, skeleton_of
 
 
 def markers_with_a_gap():
@@ -51,8 +52,10 @@ def test_header_says_units_rate_and_names(tmp_path):
 
 def test_markers_of_a_run_name_what_they_are():
     arrays = skeleton_arrays()
-    keypoints = {"names": np.array(["hat"]), "positions": np.zeros((20, 1, 3)), "radius": np.array([0.05])}
-    ellipsoids = {"centers": np.ones((20, 2, 3)), "body": np.array([4, -1])}
+    none = np.zeros((20, 1))
+    paths = KeyPointPaths(np.zeros((20, 1, 3)), none > 0, none.astype(int), none)
+    keypoints = KeyPoints(("hat",), np.array([0.05]), paths, np.zeros((0, 2), int))
+    ellipsoids = shells_at(np.ones((20, 2, 3)), [4, -1])
     markers = markers_from_run(skeleton_of(arrays), ellipsoids=ellipsoids, keypoints=keypoints)
     assert markers.names[-3:] == ("hat", "ellipsoid000", "ellipsoid001")
     assert markers.descriptions[-3:] == (
@@ -61,7 +64,7 @@ def test_markers_of_a_run_name_what_they_are():
         "centre of an ellipsoid of no body",
     )
     with pytest.raises(MotionError, match="have \\[19, 20\\] frames"):
-        markers_from_run(skeleton_of(arrays), ellipsoids={"centers": np.ones((19, 2, 3)), "body": np.array([4, -1])})
+        markers_from_run(skeleton_of(arrays), ellipsoids=shells_at(np.ones((19, 2, 3)), [4, -1]))
 
 
 @pytest.mark.parametrize(

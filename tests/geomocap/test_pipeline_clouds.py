@@ -11,7 +11,7 @@ import open3d as o3d
 import pytest
 
 from geomocap.config import load_config
-from geomocap.dense import CloudSettings
+from geomocap.dense.dense_settings import CloudSettings
 from geomocap.errors import GeometryError, RunError
 from geomocap.files.capture import Capture, CaptureInfo, write_capture_info
 from geomocap.files.rigs import write_rig

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import geomocap
-from geomocap.carving import CarvingSettings
+from geomocap.carving.carving_settings import CarvingSettings
 from geomocap.errors import CaptureError, GeometryError
 from tests.geomocap.ball import RADIUS, Texture, off_surface, photograph, ring
 from tests.geomocap.moving_chains import chain, same_partition

@@ -1,6 +1,6 @@
 """Files of a run: what is written comes back; what others wrote, or an older version, is read or refused clearly."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,19 +29,7 @@ from geomocap.model.hierarchy import parents_first
 from geomocap.model.keypoint_paths import KeyPointPaths, KeyPoints
 from geomocap.model.trajectories import Tracks, Trajectories
 from geomocap.trajectories.smoothing import smooth_motion
-from tests.geomocap.articulated import articulated_skeleton, skeleton_arrays
-
-
-def alike(one, other):
-    """Whether two values hold the same in all their fields."""
-    for f in fields(one):
-        a, b = getattr(one, f.name), getattr(other, f.name)
-        if hasattr(a, "__dataclass_fields__"):
-            alike(a, b)
-        elif a is None:
-            assert b is None
-        else:
-            np.testing.assert_array_equal(a, b, err_msg=f.name)
+from tests.geomocap.articulated import alike, articulated_skeleton, skeleton_arrays
 
 
 def some_tracks(seed=0) -> Tracks:

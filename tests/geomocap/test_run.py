@@ -14,6 +14,8 @@ from geomocap.files.frame_files import read_voxels, write_voxels
 from geomocap.files.run import Run, stage_key
 from geomocap.model.frame_geometry import Voxels
 
+HERE = "geomocap.files.run"
+
 
 def test_interrupted_writing_leaves_nothing(tmp_path):
     def interrupted(path):
@@ -68,13 +70,13 @@ def test_stage_with_a_deleted_output_is_not_done(tmp_path):
 
 def test_key_depends_on_everything():
     keys = {
-        stage_key("a", {"x": 1}),
-        stage_key("a", {"x": 2}),
-        stage_key("b", {"x": 1}),
-        stage_key("a", {"x": 1}, "up"),
+        stage_key(HERE, "a", {"x": 1}),
+        stage_key(HERE, "a", {"x": 2}),
+        stage_key(HERE, "b", {"x": 1}),
+        stage_key(HERE, "a", {"x": 1}, "up"),
     }
     assert len(keys) == 4
-    assert stage_key("a", {"x": 1, "y": 2}) == stage_key("a", {"y": 2, "x": 1})
+    assert stage_key(HERE, "a", {"x": 1, "y": 2}) == stage_key(HERE, "a", {"y": 2, "x": 1})
 
 
 def test_of_an_npz_file_what_is_named_is_read(tmp_path):

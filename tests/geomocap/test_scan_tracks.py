@@ -14,8 +14,9 @@ from geomocap.config import load_config
 from geomocap.errors import GeometryError
 from geomocap.files.run import Run
 from geomocap.files.scan_geometry import ScanSurface, places_on
+from geomocap.files.scan_settings import ScanSettings
 from geomocap.files.scan_tracks import scan_tracks
-from geomocap.files.scans import Scans, ScanSettings, open_scans
+from geomocap.files.scans import Scans, open_scans
 from geomocap.pipeline import Job, segment
 from geomocap.scheduling import threads
 

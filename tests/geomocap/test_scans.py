@@ -15,7 +15,8 @@ from geomocap.errors import GeometryError
 from geomocap.export.run_export import run_up
 from geomocap.files.frame_files import write_voxels
 from geomocap.files.run import Run
-from geomocap.files.scans import ScanSettings, open_scans
+from geomocap.files.scan_settings import ScanSettings
+from geomocap.files.scans import open_scans
 from geomocap.model.frame_geometry import Voxels
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.sources import geometry_of

@@ -8,13 +8,15 @@ from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
 from geomocap.model.hierarchy import Hierarchy, connect_bodies
+from geomocap.model.skeleton import Skeleton
 from geomocap.segmentation.axis_joints import grow_joints
 from geomocap.segmentation.m3 import segment_m3
 from geomocap.segmentation.m3_result import Segmentation
 from geomocap.segmentation.m3_settings import SegmentationSettings
 from geomocap.segmentation.skeleton_settings import SkeletonSettings
 from geomocap.skeleton.bone_motion import fit_motion, fit_offsets, forward_kinematics
-from geomocap.skeleton.m3_skeleton import Skeleton, skeleton_m3
+from geomocap.skeleton.m3_skeleton import skeleton_m3
+from tests.geomocap.articulated import alike
 from tests.geomocap.segmentation_scenes import hinged_arm
 
 SPACING = 0.008
@@ -162,7 +164,8 @@ def test_hinge_is_found(segmentation, skeleton):
 
 
 def test_fixed_joints_are_the_forward_kinematics(skeleton):
-    positions = skeleton.bone_fixed_positions()
+    bones = (skeleton.hierarchy, skeleton.offsets, skeleton.local_rotations, skeleton.root_positions)
+    positions = forward_kinematics(*bones)[0]
     if skeleton.fixed_joints:
         np.testing.assert_array_equal(skeleton.joint_positions, positions)
     else:
@@ -178,24 +181,12 @@ def test_skeleton_keeps_its_promises(segmentation, skeleton):
     np.testing.assert_allclose(np.linalg.det(skeleton.body_rotations), 1.0)
     steps = np.einsum("tbji,tbjk->tbik", skeleton.body_rotations[:-1], skeleton.body_rotations[1:])
     assert Rotation.from_matrix(steps.reshape(-1, 3, 3)).magnitude().max() < 1.2  # no axis flips
-    assert skeleton.parents[skeleton.root] == -1
-
-
-def test_arrays_and_back(skeleton):
-    arrays = skeleton.arrays()
-    assert all(array.dtype != object for array in arrays.values())
-    again = Skeleton.from_arrays(arrays)
-    for name, array in arrays.items():
-        np.testing.assert_array_equal(array, again.arrays()[name])
-    del arrays["offsets"]
-    with pytest.raises(GeometryError, match="no array 'offsets'"):
-        Skeleton.from_arrays(arrays)
+    assert skeleton.hierarchy.parents[skeleton.root] == -1
 
 
 def test_the_same_twice(segmentation, skeleton):
     again = skeleton_m3(segmentation, 15, SkeletonSettings(fixed_joints=skeleton.fixed_joints))
-    for name, array in skeleton.arrays().items():
-        np.testing.assert_array_equal(array, again.arrays()[name])
+    alike(skeleton, again)
 
 
 def test_bad_shapes_are_refused(skeleton):

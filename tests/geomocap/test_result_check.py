@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geomocap.carving import Undistortion
-from geomocap.evaluation.self_check import check_result
+from geomocap.carving.silhouette_views import Undistortion
+from geomocap.errors import RunError
+from geomocap.evaluation.result_check import check_result
+from geomocap.files.check_file import read_self_check, write_self_check
+from geomocap.files.run import Run
+from geomocap.model.self_check import SelfCheck
 from geomocap.model.surface import surface_through
 from geomocap.skeleton.body_observations import SkinPoints
 from geomocap.skeleton.kinematics import BodyMotion
@@ -80,3 +84,38 @@ def test_a_camera_that_sees_nothing_has_no_say(rig):
     found = check(rig, blind=4)
     assert np.isnan(found.left_out[4]).all() and np.isnan(found.model[4]).all()
     assert np.isfinite(np.delete(found.left_out, 4, axis=0)).all()
+
+
+def made_check(model=0.95, left_out=0.9, camera_low=None):
+    cameras = ("a", "b", "c", "d")
+    outlines, hulls = np.full((4, 3), model), np.full((4, 3), left_out)
+    if camera_low is not None:
+        hulls[camera_low] = 0.4
+    outlines[1, 2] = np.nan
+    return SelfCheck(cameras, np.array([0, 5, 9]), outlines, hulls, 0.002)
+
+
+def test_verdict_in_plain_words():
+    assert made_check().verdict() == ("trust it", ())
+    word, reasons = made_check(model=0.7).verdict()
+    assert word == "check it" and "70%" in reasons[0]
+    assert made_check(model=0.5).verdict()[0] == "don't use it"
+    assert made_check().verdict(("turns are unsure",)) == ("check it", ("turns are unsure",))
+
+
+def test_a_camera_that_contradicts_is_named():
+    word, reasons = made_check(camera_low=2).verdict()
+    assert word == "check it" and "silhouettes of c contradict" in reasons[0]
+    assert made_check(camera_low=2).contradicting == ("c",)
+
+
+def test_what_was_checked_is_read_as_it_was_written(tmp_path):
+    run, made = Run(tmp_path), made_check()
+    assert read_self_check(run) is None
+    write_self_check(run, made)
+    found = read_self_check(run)
+    np.testing.assert_array_equal(found.model, made.model)
+    assert found.figures == pytest.approx(made.figures, abs=1e-4) and found.cameras == made.cameras
+    (tmp_path / "check.json").write_text('{"cameras": ["a"], "frames": [0], "model": [], "left_out": []}')
+    with pytest.raises(RunError, match=r"check\.json: damaged"):
+        read_self_check(run)

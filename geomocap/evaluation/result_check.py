@@ -13,8 +13,6 @@ Three questions, each asked of what the others did not use for their answer:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -22,44 +20,54 @@ import open3d as o3d
 
 from geomocap.carving.carving_settings import HullSettings
 from geomocap.carving.hull import hull
-from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.carving.silhouette_views import PinholeViews, Undistortion
 from geomocap.carving.visibility import SurfaceVoxels, depth_buffers
 from geomocap.carving.voxel_grid import Grid
+from geomocap.files.capture import Capture
+from geomocap.files.results import read_diagnostics, read_silhouette, read_skeleton
+from geomocap.files.run import Run
 from geomocap.model.rig import Rig
+from geomocap.model.self_check import SelfCheck
 from geomocap.skeleton.kinematics import BodyMotion
-from geomocap.subject.model_mesh import ModelMesh
+from geomocap.subject.model_mesh import ModelMesh, model_mesh
+from geomocap.subject.subject_model import MODEL_FILE, read_model
 
+FRAMES = 6  # evenly spread
+MESH_TRIANGLES = 20000
 LONGEST_SIDE = 320  # pixels in which outlines are compared
 CELLS = 96  # along the longest side of the hull that is drawn into a camera left out
 _AROUND = 0.15  # by which the volume of the left-out hull is larger than the subject
 _ALL_FACES = 63
 
-Verdict = Literal["trust it", "check it", "don't use it"]
 
+def check_run(run: Run, capture: Capture) -> SelfCheck | None:
+    """Compare a run's motion with its silhouettes; None if it has no model, skeleton or silhouettes.
 
-@dataclass(frozen=True)
-class SelfCheck:
-    """Agreement of a result with what it was made from.
-
-    Attributes
+    Parameters
     ----------
-    cameras : tuple of C str
-    frames : (F,) int
-        The frames looked at.
-    model : (C, F) float
-        Intersection over union of the drawn model and the silhouette; NaN where the camera sees nothing of it.
-    left_out : (C, F) float
-        The same of the hull of all other cameras; NaN where it can't be made.
-    residual : float
-        Root mean square distance of surface points from where their bodies carry them, median over the points,
-        as a fraction of the subject's diagonal; NaN if there are none.
+    run : Run
+    capture : Capture
+        What it was made from.
     """
+    needed = (MODEL_FILE, "skeleton.npz", "silhouettes")
+    if not capture.is_calibrated or not all((run.path / name).exists() for name in needed):
+        return None
+    skeleton, mesh = read_skeleton(run), model_mesh(read_model(run.path / MODEL_FILE), MESH_TRIANGLES)
+    undistortion = Undistortion.of(capture.rig)
+    chosen = np.unique(np.linspace(0, len(skeleton.body_rotations) - 1, FRAMES).round().astype(int))
 
-    cameras: tuple[str, ...]
-    frames: np.ndarray
-    model: np.ndarray
-    left_out: np.ndarray
-    residual: float
+    def views(frame: int) -> PinholeViews:
+        return undistortion.views([read_silhouette(run, camera, frame) for camera in capture.cameras])
+
+    start = skeleton.body_positions[0]
+    shifts = skeleton.body_positions - np.einsum("tbij,bj->tbi", skeleton.body_rotations, start)
+    motion = BodyMotion(skeleton.body_rotations, shifts)
+    residual = float("nan")
+    if (run.path / "diagnostics.npz").exists():
+        found = read_diagnostics(run).sample_residuals
+        if found is not None and len(found):
+            residual = float(np.median(found)) / float(np.linalg.norm(np.ptp(mesh.surface.vertices, axis=0)))
+    return check_result(capture.cameras, chosen.tolist(), views, capture.rig.undistorted(), mesh, motion, residual)
 
 
 def check_result(
