@@ -324,8 +324,7 @@ def _separation(results: Results, stage: ViewStage | None, desk: Desk) -> list[B
     followed = _FOLLOWED.get(str(found.get("paths", "")), "motion paths")
     words = (
         f"The bodies come from {len(found['sample_body'])} {followed}, followed through all frames. Where a subject "
-        "bends in many small steps, like a trunk or a tail, any border is arbitrary: the other numbers of bodies are "
-        "as good. --bodies sets a number, --min-turn the criterion."
+        "bends evenly, like a tail, any border is arbitrary: --bodies sets their number, --min-turn the criterion."
     )
     blocks = desk.sheet("alternatives", separation.alternatives_sheet(results, stage), "Samples by body", words)
     if "curve_bodies" in found and len(found["curve_bodies"]) > 1:

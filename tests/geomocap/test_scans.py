@@ -24,7 +24,7 @@ from geomocap.scheduling import threads
 
 @pytest.mark.parametrize("ending", ["ply", "obj", "stl", "glb"])
 def test_mesh_is_sampled_on_its_surface_evenly(tmp_path, ending):
-    trimesh.creation.box(diagonals=(2, 4, 6)).export(tmp_path / f"box.{ending}")
+    trimesh.creation.box(extents=(2, 4, 6)).export(tmp_path / f"box.{ending}")
     scans = open_scans(tmp_path / f"box.{ending}", ScanSettings(samples=8800))
     points = scans.points(0)
     on_face = np.isclose(np.abs(points), [1, 2, 3], atol=1e-5)
@@ -101,7 +101,7 @@ def test_nan_points_are_missing_in_every_format(tmp_path):
         np.testing.assert_array_equal(open_scans(tmp_path / name, ScanSettings()).points(0), expected)
     with pytest.raises(GeometryError, match=r"c\.npz, frame 1: all 6 points are missing \(NaN\)"):
         open_scans(tmp_path / "c.npz", ScanSettings()).points(1)
-    box = trimesh.creation.box(diagonals=(2, 4, 6))
+    box = trimesh.creation.box(extents=(2, 4, 6))
     box.vertices[0] = np.nan
     box.export(tmp_path / "d.ply")
     assert np.isfinite(open_scans(tmp_path / "d.ply", ScanSettings()).points(0)).all()
@@ -120,7 +120,7 @@ def test_points_that_can_be_no_surface_are_refused(tmp_path):
     np.save(tmp_path / "away.npy", np.eye(3) + 1e7)
     with pytest.raises(GeometryError, match=r"away\.npy, frame 0: .* from the origin.*subtract the same offset"):
         open_scans(tmp_path / "away.npy", ScanSettings()).points(0)
-    box = trimesh.creation.box(diagonals=(2, 4, 6))
+    box = trimesh.creation.box(extents=(2, 4, 6))
     box.vertices[0] = np.inf
     box.export(tmp_path / "far.ply")
     with pytest.raises(GeometryError, match=r"far\.ply: .*infinite"):
