@@ -8,16 +8,23 @@ OUT ?= demo
 export PYTHON
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test test-fast lint bench clean
+.PHONY: demo test test-fast lint bench docs settings package clean
 
 demo: .stamps/core
 	$(BIN)/geomocap demo $(OUT)
 
+# What compiles most kernels, and what compares numbers of threads, runs by itself with all cores; then the rest runs in
+# two processes of one thread each, every file in one of them.
+ALONE := tests/test_accuracy.py tests/geomocap/test_scheduling.py tests/geomocap/test_patches_tracking.py
+SIDE_BY_SIDE := -n 2 --dist loadfile $(addprefix --ignore=,$(ALONE))
+
 test: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(ALONE)
+	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(SIDE_BY_SIDE)
 
 test-fast: .stamps/dev
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow" $(ALONE)
+	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" $(SIDE_BY_SIDE)
 
 lint: .stamps/dev
 	$(BIN)/ruff check .
@@ -26,6 +33,18 @@ lint: .stamps/dev
 
 bench: .stamps/dev
 	$(BIN)/python -m tests.benchmarks
+
+# The pages, into site/: open site/index.html (the search wants a server: python -m http.server -d site).
+docs: .stamps/dev
+	$(BIN)/python -m tools.results_page
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+# Wheel and source package, into dist/, installed and tried in a clean environment outside of this folder.
+package: .stamps/dev
+	tools/check_package.sh $(BIN)/python
+# docs/settings.md, written from the settings models
+settings: .stamps/dev
+	$(BIN)/python -m tools.settings_page
 
 # Python compiles what is used when it is used first; the tests use most of it, in many processes
 # (a few packages bring files for other versions of Python, which can't be compiled).
@@ -42,5 +61,5 @@ bench: .stamps/dev
 	touch $@
 
 clean:
-	rm -rf $(VENV) .stamps $(OUT) .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .stamps $(OUT) site build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} +

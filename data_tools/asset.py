@@ -173,7 +173,7 @@ class AnimatedAsset:
         Parameters
         ----------
         height : float, optional
-            Vertical diagonal wanted at the clip's begin, metres; as the file has it if not given.
+            Height wanted at the clip's begin, metres; as the file has it if not given.
         samples : int
             Number of times at which the clip is looked at.
         """

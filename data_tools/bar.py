@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import tomli_w
 
-from data_tools.camera_views import PixelRays
+from data_tools.camera_views import DistortedView
 from data_tools.image_rendering import Stage, expose
 from geomocap.errors import CalibrationError
 from geomocap.files.atomic import write_atomic, write_text
@@ -123,7 +123,7 @@ def record_bar(
 
 
 def picture_bar(
-    background: np.ndarray, view: PixelRays, rig: Rig, camera: int, targets: np.ndarray, radius: float
+    background: np.ndarray, view: DistortedView, rig: Rig, camera: int, targets: np.ndarray, radius: float
 ) -> np.ndarray:
     """Render a bar in the darkened room, (H, W, 3) float32, grey levels.
 

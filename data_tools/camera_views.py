@@ -14,7 +14,7 @@ from geomocap.model.rig import Rig
 
 
 @dataclass(frozen=True)
-class PixelRays:
+class DistortedView:
     """One camera's rays, known at the corners of all pixels.
 
     Attributes
@@ -30,7 +30,7 @@ class PixelRays:
     corners: np.ndarray
 
     @classmethod
-    def of(cls, rig: Rig, camera: int) -> PixelRays:
+    def of(cls, rig: Rig, camera: int) -> DistortedView:
         """Precompute the view of one camera of a rig."""
         width, height = (int(s) for s in rig.sizes[camera])
         x, y = np.meshgrid(np.arange(width + 1.0), np.arange(height + 1.0))

@@ -44,7 +44,7 @@ def figure(height: float = 1.75, duration: float = 2.0) -> AnimatedAsset:
     Parameters
     ----------
     height : float
-        Vertical diagonal at the clip's begin, metres.
+        Height at the clip's begin, metres.
     duration : float
         Length of the clip, seconds; it repeats without a jump.
     """

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from data_tools.camera_views import PixelRays
+from data_tools.camera_views import DistortedView
 from data_tools.room import Light
 from data_tools.shading import ShadedSurface
 from geomocap.model.ray_casting import NOTHING, TriangleScene, touched_pixels
@@ -98,19 +98,19 @@ class Stage:
 
     Attributes
     ----------
-    view : PixelRays
+    view : DistortedView
     background : (H, W, 3) float32, grey levels
     floor : (H, W, 2) float32
         Where the pixels' centres meet the floor, metres; NaN elsewhere.
     """
 
-    view: PixelRays
+    view: DistortedView
     background: np.ndarray
     floor: np.ndarray
 
 
 def render_subject(
-    subject: PosedSubject, surface: ShadedSurface, rig: Rig, camera: int, view: PixelRays, light: Light
+    subject: PosedSubject, surface: ShadedSurface, rig: Rig, camera: int, view: DistortedView, light: Light
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Render the subject alone.
 
@@ -140,7 +140,7 @@ def render_subject(
 
 
 def _cast(
-    subject: PosedSubject, surface: ShadedSurface, view: PixelRays, light: Light, pixels: np.ndarray, samples: int
+    subject: PosedSubject, surface: ShadedSurface, view: DistortedView, light: Light, pixels: np.ndarray, samples: int
 ) -> tuple[np.ndarray, np.ndarray]:
     if not len(pixels):
         return np.zeros(0, np.float32), np.zeros((0, 3), np.float32)

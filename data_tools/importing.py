@@ -19,6 +19,7 @@ from geomocap.errors import CalibrationError, CaptureError, GeomocapError
 from geomocap.files.atomic import write_atomic
 from geomocap.files.capture import Capture, CaptureInfo, write_capture_info
 from geomocap.files.images import IMAGE_ENDINGS, read_image
+from geomocap.files.rigs import read_rig, write_rig
 from geomocap.files.videos import VIDEO_ENDINGS, Video
 from geomocap.model.rig import Rig
 from geomocap.progress import Progress, silent
@@ -107,7 +108,7 @@ def import_pose2sim(
         write_atomic(target, lambda p, file=file: shutil.copyfile(file, p))  # type: ignore[misc]
     progress("videos", len(files), len(files))
     rig = Rig(rig.names, tuple(cameras), np.array(rig.cam_from_world))
-    rig.write(capture / "sparse")
+    write_rig(capture / "sparse", rig)
     fps = _frame_rate(source, files)
     write_capture_info(capture, CaptureInfo(name=source.resolve().name, fps=fps, up="z", cameras=rig.names))
     opened = Capture.open(capture)
@@ -152,7 +153,7 @@ def import_colmap(
     model = next(
         (m for m in (source / "sparse" / "0", source / "sparse", source) if any(m.glob("cameras.*"))), source / "sparse"
     )
-    rig = Rig.read(model)
+    rig = read_rig(model)
     pose = np.array(rig.cam_from_world)
     pose[:, :, 3] *= metres_per_unit
     rig = Rig(rig.names, rig.cameras, pose)
@@ -169,7 +170,7 @@ def import_colmap(
             else:  # other formats are stored anew, without loss
                 write_png(target.with_suffix(".png"), read_image(file))
     progress("images", len(rig), len(rig))
-    rig.write(capture / "sparse")
+    write_rig(capture / "sparse", rig)
     write_capture_info(capture, CaptureInfo(name=source.resolve().name, fps=fps, up=up, cameras=rig.names))
     opened = Capture.open(capture)
     notes = () if metres_per_unit != 1.0 else ("the model's unit is taken as a metre; give metres_per_unit if not",)

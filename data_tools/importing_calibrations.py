@@ -21,6 +21,7 @@ from data_tools.calibration_files import (
 from geomocap.errors import CalibrationError
 from geomocap.files.capture import CaptureInfo, write_capture_info
 from geomocap.files.images import IMAGE_ENDINGS
+from geomocap.files.rigs import write_rig
 from geomocap.files.videos import VIDEO_ENDINGS, Video
 from geomocap.model.rig import Rig
 
@@ -84,7 +85,7 @@ def import_calibration(
             )
         if name not in sizes:
             notes.append(f"camera {name} has no images/{name} and no videos/{name}.mp4 yet")
-    rig.write(capture / "sparse")
+    write_rig(capture / "sparse", rig)
     if not (capture / "capture.toml").exists():
         write_capture_info(capture, CaptureInfo(name=capture.resolve().name, fps=fps, up=up, cameras=rig.names))
     return rig, tuple(notes)

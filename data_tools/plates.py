@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 
 from geomocap.errors import CaptureError
-from geomocap.silhouettes import BackgroundModel, SilhouetteSettings
-from geomocap.silhouettes.background import background_over_time
+from geomocap.silhouettes.background import BackgroundModel, background_over_time
 from geomocap.silhouettes.light import light_change
+from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 MATCHING_SIZE = 1000  # longer side of the pictures that key-points are matched on, pixels
 LEAST_MATCHES = 12

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from data_tools.camera_views import PixelRays
+from data_tools.camera_views import DistortedView
 from data_tools.solid_noise import gradient_noise
 
 
@@ -66,11 +66,11 @@ class Room:
     high: np.ndarray
     seed: int = 0
 
-    def render(self, view: PixelRays, light: Light, samples: int = 3) -> np.ndarray:
+    def render(self, view: DistortedView, light: Light, samples: int = 3) -> np.ndarray:
         """Render the empty room, antialiased with `samples`² rays a pixel: (H, W, 3) float32, grey levels."""
         return _render(view.corners, view.origin, self.low, self.high, light.vector, samples, self.seed)
 
-    def floor_positions(self, view: PixelRays) -> np.ndarray:
+    def floor_positions(self, view: DistortedView) -> np.ndarray:
         """Where each pixel's centre meets the floor: (H, W, 2) float32, metres, NaN where it meets a wall."""
         width, height = view.size
         rays = view.rays(np.arange(width * height), 1)[:, 0].astype(np.float64)

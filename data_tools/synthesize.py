@@ -13,7 +13,7 @@ from pydantic import Field
 
 from data_tools.asset import AnimatedAsset
 from data_tools.bar import BarRecording, record_bar
-from data_tools.camera_views import PixelRays
+from data_tools.camera_views import DistortedView
 from data_tools.image_rendering import FloorShadow, PosedSubject, Stage, compose, expose, render_subject
 from data_tools.placement import make_camera, outline, place_cameras
 from data_tools.room import Light, Room
@@ -22,6 +22,7 @@ from data_tools.video_writing import VideoFile
 from geomocap.errors import CaptureError
 from geomocap.files.atomic import write_atomic
 from geomocap.files.capture import CaptureInfo, write_capture_info
+from geomocap.files.rigs import write_rig
 from geomocap.model.rig import Rig
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads
@@ -141,9 +142,9 @@ def synthesize(
     else:
         _record(asset, vertices, times, world, surface, capture, truth, settings, executor, progress)
     write_truth(asset, times, vertices, settings, truth)
-    world.rig.write(truth / "sparse")
+    write_rig(truth / "sparse", world.rig)
     if not settings.withhold_calibration:
-        world.rig.write(capture / "sparse")
+        write_rig(capture / "sparse", world.rig)
     # The description comes last: a capture that was not finished does not open
     write_capture_info(capture, CaptureInfo(name=asset.name, fps=settings.fps, up="z", cameras=world.rig.names))
     return SynthesisResult(world.rig, world.footprint, times, tuple(notes))
@@ -223,7 +224,7 @@ def _record(
 
     # Empty room: rendered once a camera, and photographed once
     def make_stage(c: int) -> Stage:
-        view = PixelRays.of(rig, c)
+        view = DistortedView.of(rig, c)
         stage = Stage(view, world.room.render(view, light), world.room.floor_positions(view))
         plate = expose(stage.background, world.gains[c], settings.noise, (seed, 2, c))
         write_png(capture / "background" / f"{rig.names[c]}.png", plate)

@@ -1,23 +1,100 @@
 """Motion capture without markers and without a body model, from the geometry alone.
 
-Data flows one way: capture → geometry → segmentation → skeleton → files and pictures.
+Data flows one way: capture → geometry → segmentation → skeleton → files and pictures. What stands in `__all__` is
+public and stays: it changes only with a line in the changelog and a version in which the old way still works. All
+functions take and return values; only those that name a folder read or write files. They are loaded when they are used
+first, so that `import geomocap` is quick.
+
+>>> import geomocap, numpy as np
+>>> tracks = np.zeros((500, 60, 3))                  # yours: points, frames, metres; NaN where unseen
+>>> motion = geomocap.find_motion(tracks, fps=30)    # doctest: +SKIP
 """
 
+import importlib
 import os
-from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
 
 # Threads without work sleep instead of spinning: on a machine that does other things too, spinning makes short kernels
 # several times slower. Read when OpenMP is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-import numba
+from geomocap.kernel_cache import configure_numba
+from geomocap.version import __version__
 
-# Frames are mapped over threads that each call parallel kernels: of Numba's layers only OpenMP allows that.
-numba.config.THREADING_LAYER = "omp"  # type: ignore[attr-defined]
+configure_numba()
 
-try:
-    __version__ = version("geomocap")
-except PackageNotFoundError:  # a source tree that was never installed
-    __version__ = "0+unknown"
+if TYPE_CHECKING:
+    from geomocap.carving.frames import carve
+    from geomocap.carving.volume import working_volume
+    from geomocap.dense.dense_frame import measure_cloud
+    from geomocap.evaluation.run_evaluation import evaluate
+    from geomocap.export.run_export import export_run
+    from geomocap.files.capture import Capture, open_capture
+    from geomocap.files.scans import ScanSettings, open_scans
+    from geomocap.model.frame_geometry import Voxels
+    from geomocap.model.motion_paths import MotionPaths
+    from geomocap.model.rig import Rig
+    from geomocap.motion import Motion, MotionSettings, find_motion
+    from geomocap.segmentation.m3 import segment_m3
+    from geomocap.skeleton.m3_skeleton import skeleton_m3
+    from geomocap.subject.model_building import build_model
+    from geomocap.subject.model_following import follow_model
+    from geomocap.subject.subject_model import SubjectModel, read_model
 
-__all__ = ["__version__"]
+_HOMES = {  # where each public name is defined
+    "Capture": "geomocap.files.capture",
+    "Motion": "geomocap.motion",
+    "MotionPaths": "geomocap.model.motion_paths",
+    "MotionSettings": "geomocap.motion",
+    "Rig": "geomocap.model.rig",
+    "ScanSettings": "geomocap.files.scans",
+    "SubjectModel": "geomocap.subject.subject_model",
+    "Voxels": "geomocap.model.frame_geometry",
+    "build_model": "geomocap.subject.model_building",
+    "carve": "geomocap.carving.frames",
+    "evaluate": "geomocap.evaluation.run_evaluation",
+    "export_run": "geomocap.export.run_export",
+    "find_motion": "geomocap.motion",
+    "follow_model": "geomocap.subject.model_following",
+    "measure_cloud": "geomocap.dense.dense_frame",
+    "open_capture": "geomocap.files.capture",
+    "open_scans": "geomocap.files.scans",
+    "read_model": "geomocap.subject.subject_model",
+    "segment_m3": "geomocap.segmentation.m3",
+    "skeleton_m3": "geomocap.skeleton.m3_skeleton",
+    "working_volume": "geomocap.carving.volume",
+}
+__all__ = [
+    "Capture",
+    "Motion",
+    "MotionPaths",
+    "MotionSettings",
+    "Rig",
+    "ScanSettings",
+    "SubjectModel",
+    "Voxels",
+    "__version__",
+    "build_model",
+    "carve",
+    "evaluate",
+    "export_run",
+    "find_motion",
+    "follow_model",
+    "measure_cloud",
+    "open_capture",
+    "open_scans",
+    "read_model",
+    "segment_m3",
+    "skeleton_m3",
+    "working_volume",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'geomocap' has no attribute '{name}'")
+    return getattr(importlib.import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

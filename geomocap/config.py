@@ -7,22 +7,20 @@ from typing import Any
 
 from pydantic import Field
 
-from geomocap.bodies.motion_bodies import MotionBodiesSettings
+from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.carving.carving_settings import CarvingSettings
 from geomocap.dense.dense_settings import CloudSettings
 from geomocap.export.export_settings import ExportSettings
-from geomocap.files.scans import ScanSettings
+from geomocap.files.scan_settings import ScanSettings
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.segmentation.m3_settings import SegmentationSettings
 from geomocap.segmentation.skeleton_settings import SkeletonSettings
 from geomocap.settings import Settings, load_settings
-from geomocap.silhouettes import SilhouetteSettings
-from geomocap.skeleton.motion_skeleton import MotionSkeletonSettings
-from geomocap.skeleton.refinement import RefinementSettings
-from geomocap.subject.model_following import FollowingSettings
-from geomocap.trajectories.filters import FilterSettings
-from geomocap.trajectories.smoothing import SmoothingSettings
+from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
+from geomocap.skeleton.motion_skeleton_settings import MotionSkeletonSettings, RefinementSettings
+from geomocap.subject.following_settings import FollowingSettings
+from geomocap.trajectories.trajectory_settings import FilterSettings, SmoothingSettings
 
 
 class Config(Settings):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
+from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 from geomocap.errors import SettingsError
@@ -17,7 +19,9 @@ Model = TypeVar("Model", bound="Settings")
 class Settings(BaseModel):
     """Settings of one stage. Each field has a default that works and a description with its unit.
 
-    Every stage keeps its model beside its code; `geomocap.config` nests them into one TOML file.
+    Every stage keeps its model beside its code; `geomocap.config` nests them into one TOML file. A field's
+    `json_schema_extra` may hold "flag", a name under which the command line shows it, and "evidence", what was measured
+    with other values.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -44,6 +48,21 @@ def _holds_truth(value: Any) -> bool:
     return isinstance(value, bool)
 
 
+def leaves(model: type[BaseModel], table: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """List the single settings of a model, nested ones too, with their dotted keys."""
+    for name, field in model.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from leaves(field.annotation, f"{table}{name}.")
+        else:
+            yield f"{table}{name}", field
+
+
+def flag_of(field: FieldInfo) -> str | None:
+    """Name of a setting's flag on the command line; None if it is a key of the settings file only."""
+    extra = field.json_schema_extra
+    return str(extra["flag"]) if isinstance(extra, dict) and "flag" in extra else None
+
+
 def check_settings(model: type[Model], values: dict[str, Any], where: str = "") -> Model:
     """Make settings from plain values.
 
@@ -67,7 +86,7 @@ def check_settings(model: type[Model], values: dict[str, Any], where: str = "") 
         key = ".".join(str(p) for p in first["loc"]) or "(all)"
         start = f"{where}: " if where else ""
         if first["type"] == "extra_forbidden":
-            raise SettingsError(f"{start}unknown setting {key}; --help of the command lists them all") from None
+            raise SettingsError(f"{start}unknown setting {key}; docs/settings.md lists them all") from None
         if not first["loc"]:
             raise SettingsError(f"{start}{first['msg'].removeprefix('Value error, ')}") from None
         raise SettingsError(f"{start}setting {key} = {first['input']!r}: {first['msg']}") from None

@@ -9,17 +9,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from geomocap.evaluation import Curve, Evaluation
 from geomocap.evaluation.body_scores import LabelledFrame, labelled_frame
+from geomocap.evaluation.result import Curve, Evaluation
 from geomocap.evaluation.truth import Truth
+from geomocap.files.results import SKELETON, read_points, read_skeleton
 from geomocap.files.run import Run
+from geomocap.model.skeleton import Skeleton
 from geomocap.progress import Progress, silent
 from viz.body_colors import ACCENT, body_color, hex_color
 from viz.figures import MUTED, plot
 from viz.matching_review import error_sheet, surface_errors
 from viz.report import Block, Report, Section, missing, picture, table, text, write_report
 from viz.report import plot as plot_block
-from viz.results import read_points
 
 WORST_CURVES = 8
 KEY_FIGURES = (
@@ -149,8 +150,8 @@ def _pictures(result: Evaluation, run: Path, truth_path: Path) -> list[Block]:
         )
         frame = labelled_frame(opened, truth, worst)
         blocks.append(plot_block(body_errors(frame, truth, worst), f"Bodies in frame {worst}, the worst", words))
-    if result.matches and (run / "skeleton.npz").is_file():
-        skeleton = opened.read_npz("skeleton.npz")
+    if result.matches and opened.has(SKELETON):
+        skeleton = read_skeleton(opened)
         words = (
             "True joints (rings) and found ones (dots) that were matched, with the error between them; crosses are "
             "found joints without a true one near."
@@ -210,10 +211,10 @@ def body_errors(frame: LabelledFrame, truth: Truth, number: int) -> Figure:
 
 
 @plot
-def joint_errors(result: Evaluation, skeleton: dict[str, np.ndarray], truth: Truth, frame: int) -> Figure:
+def joint_errors(result: Evaluation, skeleton: Skeleton, truth: Truth, frame: int) -> Figure:
     """Draw matched joints, found and true, over the true surface of a frame, from two sides."""
     figure = Figure(figsize=(9.6, 5.6), dpi=140, layout="constrained")
-    found = {str(n): p for n, p in zip(skeleton["joint_names"], skeleton["joint_positions"][frame], strict=True)}
+    found = {str(n): p for n, p in zip(skeleton.joint_names, skeleton.joint_positions[frame], strict=True)}
     true = {str(n): p for n, p in zip(truth.joint_names, truth.joint_positions[frame], strict=True)}
     pairs = [(found[m.found], true[m.true]) for m in result.matches if m.found in found and m.true in true]
     matched = {m.found for m in result.matches}

@@ -12,9 +12,10 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from geomocap.model.ellipsoids import Ellipsoids
+from geomocap.model.skeleton import Skeleton
 from viz.body_colors import ACCENT, INK, body_color, hex_color
 from viz.quality_figures import Bone, Coverage, PathFigures
-from viz.results import Ellipsoids, Skeleton
 
 P = ParamSpec("P")
 
@@ -77,7 +78,7 @@ def _at_least(ax: Axes, span: float) -> None:
 @plot
 def joint_angles(skeleton: Skeleton, fps: float | None) -> Figure:
     """Plot each joint's rotation since the first frame: its size, and its parts about the parent's axes."""
-    vectors = skeleton.joint_rotations()
+    vectors = np.rad2deg(skeleton.joint_rotations())
     size = np.linalg.norm(vectors, axis=2)
     times, label = times_axis(len(vectors), fps)
     count = len(skeleton.joint_names)
@@ -186,14 +187,13 @@ def ellipsoid_errors(ellipsoids: Ellipsoids) -> Figure:
     """Plot the ellipsoids' point counts and fitting errors over time."""
     figure = figure_of(WIDTH, 2.3)
     axes = figure.subplots(1, 2)
-    colors = [hex_color(body_color(int(b))) for b in ellipsoids.body]
+    colors = [hex_color(body_color(int(b))) for b in ellipsoids.bodies]
     for ax, values, title in (
         (axes[0], ellipsoids.counts, "points of each ellipsoid"),
         (axes[1], ellipsoids.errors, "fitting error D of each ellipsoid"),
     ):
-        if values is not None:
-            for k, color in enumerate(colors):
-                ax.plot(values[:, k], color=color, lw=0.8, alpha=0.85)
+        for k, color in enumerate(colors):
+            ax.plot(values[:, k], color=color, lw=0.8, alpha=0.85)
         ax.set_title(title)
         ax.set_xlabel("frame")
         ax.set_ylim(bottom=0)

@@ -17,7 +17,7 @@ from geomocap.scheduling import map_items, threads
 from viz import scene
 from viz.drawing import GAP, fit, write_on
 from viz.rendering import Model
-from viz.results import Results
+from viz.run_contents import Results
 from viz.sheets import overlay, picture, tile_size
 from viz.viewpoints import ViewStage
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from geomocap.model.keypoint_paths import KeyPoints
 from geomocap.model.rig import Rig
 from viz.drawing import write_on
 
@@ -61,6 +62,11 @@ class Marks:
     def color(self, frame: int, k: int) -> tuple[int, int, int]:
         """Return the colour of a key-point in a frame."""
         return BRIDGED if self.bridged[frame, k] else CHOSEN if self.names[k] == self.chosen else MEASURED
+
+
+def marks_of_run(points: KeyPoints) -> Marks:
+    """Return a run's key-points to be drawn."""
+    return Marks(points.names, points.paths.positions, points.radius, points.paths.bridged, points.links)
 
 
 def marked(image: np.ndarray, camera: Rig, marks: Marks, frame: int) -> np.ndarray:

@@ -8,37 +8,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from geomocap.errors import RunError
 from geomocap.scheduling import map_items, threads
 from viz.body_colors import INK, body_color, hex_color
 from viz.drawing import resize, sheet
 from viz.figures import WIDTH, figure_of, plot, times_axis
 from viz.keypoint_marks import Marks, marked
-from viz.results import Results
+from viz.run_contents import Results
 from viz.viewpoints import ViewStage
 
 _STICKS = 12  # frames whose links are drawn
-_NEEDED = ("names", "positions", "radius")
-
-
-def read_marks(results: Results) -> Marks | None:
-    """Read `keypoints.npz`; None if the run has no key-points.
-
-    Raises
-    ------
-    RunError
-        If it is damaged or lacks an array.
-    """
-    file = results.run.path / "keypoints.npz"
-    if not file.is_file():
-        return None
-    data = results.run.read_npz(file.name)
-    missing = [n for n in _NEEDED if n not in data]
-    if missing:
-        raise RunError(f"{file}: has no array {', '.join(missing)}; run `geomocap keypoints` again")
-    bridged = data.get("bridged", np.zeros(data["positions"].shape[:2], bool))
-    links = data.get("links", np.zeros((0, 2), int))
-    return Marks(tuple(str(n) for n in data["names"]), data["positions"], data["radius"], bridged, links)
 
 
 @plot

@@ -16,7 +16,7 @@ from geomocap.model.surface import outward_normals
 from viz.body_colors import hex_color
 from viz.drawing import resize
 from viz.keypoint_marks import BRIDGED, LOST, MEASURED, Marks, marked
-from viz.results import Results
+from viz.run_contents import Results
 from viz.scene import stage as find_stage
 from viz.viewpoints import ViewStage
 from viz.volumes import spacing
@@ -108,7 +108,7 @@ class Subject:
             return SceneSurface(v.points, v.colors, v.voxel_size)
         if self.results.has("cloud", frame):
             c = self.results.cloud(frame)
-            return SceneSurface(c.positions, c.colors, spacing(c.positions))
+            return SceneSurface(c.positions, c.shown_colors, spacing(c.positions))
         points = self.tracks[:, frame]
         points = points[np.isfinite(points[:, 0])]
         return SceneSurface(points, np.full(points.shape, 150, np.uint8), spacing(points))

@@ -7,15 +7,11 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from geomocap.config import load_config
-from geomocap.dense import CloudFrame, TemplateCloud, undistorted_color
-from geomocap.errors import GeomocapError
+from geomocap.dense.dense_frame import CloudFrame, TemplateCloud
 from geomocap.matching.growing import SurfaceMatches
 from geomocap.model.ray_casting import TriangleScene
-from geomocap.pipeline.cloud_stage import measure_again
 from viz.body_colors import ACCENT, INK, body_color
 from viz.drawing import faded, sheet, text_width, write_on
-from viz.results import Results
 from viz.viewpoints import look
 
 PARTLY = (230, 130, 20)
@@ -25,29 +21,6 @@ REMOVED = (150, 15, 45)
 """Points that disagreed with their neighbours."""
 
 _LOW, _MIDDLE, _HIGH = (34, 94, 168), (250, 240, 180), (178, 24, 43)
-
-
-def measured_frame(results: Results, frame: int) -> tuple[CloudFrame, np.ndarray] | None:
-    """Measure a frame of a run once more, for what its files don't hold: seeds, regions, shifts.
-
-    Returns
-    -------
-    (CloudFrame, (H, W, 3) uint8) or None
-        With the image of the template that gave most points, free of distortion; None if the capture is not at hand
-        or nothing is found.
-    """
-    capture = results.capture
-    if capture is None or not capture.is_calibrated:
-        return None
-    settings = load_config(results.run.path / "run.toml").cloud
-    try:
-        found, groups = measure_again(results.run, capture, settings, frame)
-    except GeomocapError:
-        return None
-    if not len(found.points):
-        return None
-    template = max(found.templates, key=lambda t: len(t.points)).group.template
-    return found, undistorted_color(capture.frame(capture.cameras[template], frame), groups, template)
 
 
 def matched_picture(image: np.ndarray, surface: SurfaceMatches, width: int = 900) -> np.ndarray:

@@ -8,13 +8,13 @@ import numpy as np
 import open3d as o3d
 
 from geomocap.errors import GeometryError, RunError
+from geomocap.files.frame_files import read_points
 from geomocap.files.open3d_geometry import read_by_open3d
 from geomocap.model.surface import vertex_normals
 from viz.body_colors import body_colors
 from viz.drawing import sheet, write_png
 from viz.floor import floor
 from viz.rendering import Model
-from viz.results import read_points
 from viz.shapes import Mesh
 from viz.sheets import VIEWS, tile_size
 from viz.viewpoints import stage_of, up_vector
@@ -56,10 +56,10 @@ def load(path: Path) -> Mesh:
     if ending not in CLOUDS:
         raise GeometryError(f"{path}: holds no triangles; is it truncated?")
     try:
-        points = read_points(path)
+        points = read_points(path).finite
     except GeometryError:
         raise GeometryError(f"{path}: holds neither triangles nor points; is it whole?") from None
-    colors = points.colors if points.bodies is None else body_colors(points.bodies)
+    colors = body_colors(points.body) if (points.body >= 0).any() else points.shown_colors
     return gems(points.positions, colors, 0.75 * spacing(points.positions), points.normals)
 
 

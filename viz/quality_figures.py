@@ -8,10 +8,13 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from geomocap.model.diagnostics import Diagnostics
+from geomocap.model.ellipsoids import Ellipsoids
+from geomocap.model.skeleton import Skeleton
 from geomocap.scheduling import map_items, threads
 from viz import scene
 from viz.rendering import Look, Model
-from viz.results import Ellipsoids, Results, Skeleton
+from viz.run_contents import Results
 from viz.viewpoints import camera_view
 
 
@@ -26,7 +29,7 @@ class Coverage:
     fraction : (C, T) float
         Fraction of the pixels, 0–1, NaN where there is no silhouette.
     cut : (C, T) bool
-        Whether the silhouette runs along the image's border: the subject is partly out of the picture.
+        Whether the silhouette runs along the image's border: the subject is partly out of view.
     """
 
     cameras: tuple[str, ...]
@@ -167,26 +170,25 @@ class PathFigures:
     threshold: float | None
 
 
-def relative_paths(ellipsoids: Ellipsoids, diagnostics: dict[str, np.ndarray]) -> PathFigures:
+def relative_paths(ellipsoids: Ellipsoids, diagnostics: Diagnostics) -> PathFigures:
     """Return the relative paths and distance curves as the M3 paper defines them (section 7)."""
     centers = ellipsoids.centers
     relative = centers - _mean_over_time(centers)
-    weight = ellipsoids.counts[0] if ellipsoids.counts is not None else np.ones(centers.shape[1])
     there = np.isfinite(centers[0]).all(axis=1)
-    middle = np.average(centers[0, there], axis=0, weights=np.maximum(weight[there], 1e-9))
-    seeds = np.atleast_1d(diagnostics.get("seeds", np.array([], int)))
-    seed = int(seeds[0]) if len(seeds) else int(np.nanargmin(np.linalg.norm(centers[0] - middle, axis=1)))
+    middle = np.average(centers[0, there], axis=0, weights=np.maximum(ellipsoids.counts[0, there], 1e-9))
+    seeds = diagnostics.seeds
+    if seeds is not None and len(seeds):
+        seed = int(seeds[0])
+    else:
+        seed = int(np.nanargmin(np.linalg.norm(centers[0] - middle, axis=1)))
     distance = np.linalg.norm(relative - relative[:, seed : seed + 1], axis=2)
-    integrals = diagnostics.get("integrals")
-    if integrals is None or np.ndim(integrals) != 2:
+    integrals = diagnostics.integrals
+    if integrals is None:
         count = relative.shape[1]
         integrals = np.array(
             [_mean_over_time(np.linalg.norm(relative - relative[:, k : k + 1], axis=2)) for k in range(count)]
         )
-    threshold = diagnostics.get("threshold")
-    return PathFigures(
-        relative, seed, distance, integrals, None if threshold is None else float(np.ravel(threshold)[0])
-    )
+    return PathFigures(relative, seed, distance, integrals, diagnostics.threshold)
 
 
 def _mean_over_time(values: np.ndarray) -> np.ndarray:
@@ -216,8 +218,8 @@ def assess(results: Results, frames: list[int]) -> Quality:
     shaking = jitter(skeleton) if skeleton is not None else None
     unassigned = None
     if "bodies" in results.kinds:
-        labels = [results.bodies(f).bodies for f in frames if results.has("bodies", f)]
-        unassigned = float(np.mean(np.concatenate([np.asarray(b) for b in labels]) < 0)) if labels else None
+        labels = [results.bodies(f).body for f in frames if results.has("bodies", f)]
+        unassigned = float(np.mean(np.concatenate(labels) < 0)) if labels else None
     quality = Quality(cover, agree, bone_list, shaking, unassigned)
     return Quality(cover, agree, bone_list, shaking, unassigned, [*results.remarks, *warnings(results, quality)])
 
@@ -266,7 +268,7 @@ def warnings(results: Results, quality: Quality) -> list[str]:
                 at = results.run.frames(kind)[int(np.argmax(change)) + 1]
                 said.append(f"{kind}: the number of points jumps by {100 * change.max():.0f} % at frame {at}.")
     ellipsoids, skeleton = results.ellipsoids, results.skeleton
-    if ellipsoids is not None and ellipsoids.n_bodies == 1:
+    if ellipsoids is not None and ellipsoids.body_count == 1:
         said.append("Only one body was found: nothing moves against anything else, or the threshold is too high.")
     if quality.unassigned is not None and quality.unassigned > 0.1:
         said.append(f"{100 * quality.unassigned:.0f} % of the points belong to no body.")

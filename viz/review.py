@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from geomocap.dense.dense_frame import CloudFrame
 from geomocap.errors import GeometryError, RunError
-from geomocap.files.atomic import write_atomic
 from geomocap.files.capture import Capture
+from geomocap.files.results import read_cloud_record
 from geomocap.files.run import Run
-from geomocap.pipeline.cloud_stage import read_cloud_record
 from geomocap.progress import Progress, silent
 from viz import figures, keypoint_plots, separation, sheets
 from viz import track_pictures as tracks
-from viz.drawing import write_png
+from viz.desk import Desk
 from viz.films import motion_video
-from viz.matching_review import frame_sheet, measured_frame, template_sheet
+from viz.keypoint_marks import marks_of_run
+from viz.matching_review import frame_sheet, template_sheet
 from viz.quality_figures import Quality, assess, relative_paths
-from viz.report import Block, Report, missing, picture, plot, table, text, video, write_report
-from viz.results import Results
+from viz.report import Block, Report, missing, table, text, video, write_report
+from viz.run_contents import Results
 from viz.scene import stage as find_stage
 from viz.sections import (
     bodies_table,
@@ -34,6 +34,7 @@ from viz.sections import (
     summary,
     timings_table,
     title,
+    verdict,
 )
 from viz.viewpoints import ViewStage
 
@@ -46,45 +47,12 @@ _FOLLOWED = {
 }
 
 
-@dataclass
-class Desk:
-    """What is being written: files in RUN/review, and their progress."""
-
-    folder: Path
-    progress: Progress
-    total: int
-    written: list[Path] = field(default_factory=list)
-    done: int = 0
-
-    def step(self) -> None:
-        """Report one more part as done."""
-        self.done += 1
-        self.progress("review", min(self.done, self.total), self.total)
-
-    def sheet(self, name: str, image: np.ndarray | None, heading: str, words: str) -> list[Block]:
-        """Write a picture as PNG and return its block; nothing if there is no picture."""
-        self.step()
-        if image is None:
-            return []
-        path = self.folder / f"{name}.png"
-        write_png(path, image)
-        self.written.append(path)
-        return [picture(image, heading, words)]
-
-    def plot(self, name: str, png: bytes, heading: str, words: str) -> list[Block]:
-        """Write a plot and return its block."""
-        self.step()
-        path = self.folder / f"{name}.png"
-        write_atomic(path, lambda p: p.write_bytes(png))
-        self.written.append(path)
-        return [plot(png, heading, words)]
-
-
 def review(
     run: Run,
     capture: Capture | None = None,
     *,
     frames: Sequence[int] | None = None,
+    measured: Callable[[int], tuple[CloudFrame, np.ndarray] | None] = lambda _: None,
     progress: Progress = silent,
 ) -> list[Path]:
     """Write picture sheets, a video and `report.html` of a run into RUN/review, from the files that are there.
@@ -98,6 +66,9 @@ def review(
         What the run was made from: needed for everything drawn over the images.
     frames : sequence of int, optional
         Frames for the sheets; four evenly spread ones if not given.
+    measured : callable, optional
+        Gives the surface measurement of a frame, with regions and shifts that files don't hold, and the undistorted
+        image of the template that gave most points; None: not to be had. Without it these pictures are left out.
     progress : Progress
         Called as stage "review", and "video" while the video is drawn.
 
@@ -132,11 +103,11 @@ def review(
     quality = assess(results, chosen)
     desk.step()
     parts = [
-        section("Result", [*summary(quality), *_result(results, stage, chosen, desk)]),
+        section("Result", [*verdict(results), *summary(quality), *_result(results, stage, chosen, desk)]),
         section("What went in", _inputs(results, stage, chosen, desk)),
         section("Silhouettes", _silhouettes(results, quality, chosen, desk)),
         section("Volume and points", _volume(results, stage, chosen, desk)),
-        section("Surface measurement", _clouds(results, chosen, desk)),
+        section("Surface measurement", _clouds(results, measured, chosen, desk)),
         section("Surface points through time", _tracks(results, stage, chosen, desk)),
         section("Ellipsoids and their paths", _ellipsoids(results, stage, chosen, desk)),
         section("Rigid bodies", _bodies(results, stage, chosen, desk)),
@@ -225,7 +196,12 @@ def _volume(results: Results, stage: ViewStage | None, frames: list[int], desk: 
     return blocks
 
 
-def _clouds(results: Results, frames: list[int], desk: Desk) -> list[Block]:
+def _clouds(
+    results: Results,
+    measured: Callable[[int], tuple[CloudFrame, np.ndarray] | None],
+    frames: list[int],
+    desk: Desk,
+) -> list[Block]:
     record = read_cloud_record(results.run)
     if record is None:
         return []
@@ -236,11 +212,11 @@ def _clouds(results: Results, frames: list[int], desk: Desk) -> list[Block]:
     rows = [(reason, f"{n / record.frames:,.0f}") for reason, n in sorted(record.reasons.items(), key=lambda r: -r[1])]
     blocks.append(table(("reason", "in a frame"), rows, numbers=(1,)))
     number = frames[len(frames) // 2]
-    measured = measured_frame(results, number)
-    if measured is None:
+    found = measured(number)
+    if found is None:
         desk.step()
         return blocks
-    frame, image = measured
+    frame, image = found
     words = (
         "The template that gave most points. Left: points matched in all search images, in some, and those that "
         "disagreed with their neighbours; rings are the seeds. Middle: the seeds' regions and the shifts along which "
@@ -254,8 +230,8 @@ def _clouds(results: Results, frames: list[int], desk: Desk) -> list[Block]:
 
 
 def _tracks(results: Results, stage: ViewStage | None, frames: list[int], desk: Desk) -> list[Block]:
-    found = None if stage is None else tracks.read_tracks(results)
-    if stage is None or found is None or not len(found.positions):
+    found = None if stage is None else results.tracks
+    if stage is None or found is None or not len(found.trajectories):
         return []
     words = (
         "Points of the surface followed in the images, with their way over the last frames. Neighbours should move "
@@ -290,17 +266,15 @@ def _ellipsoids(results: Results, stage: ViewStage | None, frames: list[int], de
         "A relative path is a path minus its mean. Ellipsoids of one body move alike: their curves lie together, and "
         "their distance curves to each other stay low."
     )
-    curves = figures.path_curves(paths, e.body, results.up, results.fps)
+    curves = figures.path_curves(paths, e.bodies, results.up, results.fps)
     blocks += desk.plot("path_curves", curves, "Relative paths and distance curves", words)
     words = (
         "The mean of a distance curve over time decides whether two ellipsoids belong together. A gap in the sorted "
         "integrals is a clear decision; a smooth slope is not."
     )
-    blocks += desk.plot("integrals", figures.integrals(paths, e.body), "Integrals", words)
-    if e.counts is not None or e.errors is not None:
-        words = "Steps and spikes show where the matching in time had to split or merge ellipsoids."
-        blocks += desk.plot("ellipsoid_curves", figures.ellipsoid_errors(e), "Sizes and fitting errors", words)
-    return blocks
+    blocks += desk.plot("integrals", figures.integrals(paths, e.bodies), "Integrals", words)
+    words = "Steps and spikes show where the matching in time had to split or merge ellipsoids."
+    return blocks + desk.plot("ellipsoid_curves", figures.ellipsoid_errors(e), "Sizes and fitting errors", words)
 
 
 def _bodies(results: Results, stage: ViewStage | None, frames: list[int], desk: Desk) -> list[Block]:
@@ -319,26 +293,27 @@ def _bodies(results: Results, stage: ViewStage | None, frames: list[int], desk: 
 
 def _separation(results: Results, stage: ViewStage | None, desk: Desk) -> list[Block]:
     found = results.diagnostics
-    if stage is None or "sample_body" not in found:
+    chosen = found.sample_body
+    if stage is None or chosen is None:
         return []
-    followed = _FOLLOWED.get(str(found.get("paths", "")), "motion paths")
+    followed = _FOLLOWED.get(found.paths or "", "motion paths")
     words = (
-        f"The bodies come from {len(found['sample_body'])} {followed}, followed through all frames. Where a subject "
+        f"The bodies come from {len(chosen)} {followed}, followed through all frames. Where a subject "
         "bends in many small steps, like a trunk or a tail, any border is arbitrary: the other numbers of bodies are "
-        "as good. --bodies sets a number, --motion_bodies.min_turn_deg the criterion."
+        "as good. --bodies sets a number, --min-turn the criterion."
     )
     blocks = desk.sheet("alternatives", separation.alternatives_sheet(results, stage), "Samples by body", words)
-    if "curve_bodies" in found and len(found["curve_bodies"]) > 1:
+    if found.curve_bodies is not None and found.curve_strengths is not None and len(found.curve_bodies) > 1:
         words = (
             "The weakest body goes, again and again. A steep rise beside the number found is a clear decision; a slow "
             "one means that a few bodies more or less explain the motion as well."
         )
-        number = len(np.unique(found["sample_body"][found["sample_body"] >= 0]))
-        curve = separation.elimination_curve(found["curve_bodies"], found["curve_strengths"], number)
+        number = len(np.unique(chosen[chosen >= 0]))
+        curve = separation.elimination_curve(found.curve_bodies, found.curve_strengths, number)
         blocks += desk.plot("elimination", curve, "Number of bodies", words)
-    if "reliability" in found and found["reliability"].shape[1] > 0:
+    if found.reliability is not None and found.reliability.shape[1] > 0:
         words = "Dark: the body was hardly measured there, and its motion is bridged from its neighbours and in time."
-        blocks += desk.plot("reliability", separation.reliability(found["reliability"], results.fps), "Measured", words)
+        blocks += desk.plot("reliability", separation.reliability(found.reliability, results.fps), "Measured", words)
     return blocks
 
 
@@ -373,16 +348,17 @@ def _skeleton(
 
 
 def _keypoints(results: Results, stage: ViewStage | None, frames: list[int], desk: Desk) -> list[Block]:
-    marks = keypoint_plots.read_marks(results)
-    if stage is None or marks is None:
+    points = results.keypoints
+    if stage is None or points is None:
         return []
+    marks = marks_of_run(points)
     words = (
         "Their ways from the front and from the top, with links at some moments; dotted where the body bridges a gap."
     )
     blocks = desk.plot("keypoint_paths", keypoint_plots.paths(marks, stage), "Ways of the key-points", words)
-    if (velocities := results.run.read_npz("keypoints.npz").get("velocities")) is not None:
+    if points.velocities is not None:
         words = "A jump where a curve turns dotted, or back, says that the bridge didn't hold."
-        curves = keypoint_plots.speeds(marks, velocities, results.fps)
+        curves = keypoint_plots.speeds(marks, points.velocities, results.fps)
         blocks += desk.plot("keypoint_speeds", curves, "Speeds of the key-points", words)
     words = "Each should stay on the same spot of the subject. Orange: bridged, no trajectory inside in this frame."
     over = keypoint_plots.overlay_sheet(results, marks, frames)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from viz import body_colors as palette
-from viz.results import Results
+from viz.run_contents import Results
 from viz.shapes import EMPTY, Mesh, ball, bone, ellipsoid, join, tube
 from viz.viewpoints import ViewStage, stage_of, up_vector
 from viz.volumes import cubes, gems, skin, spacing
@@ -45,7 +45,7 @@ def cloud(results: Results, frame: int) -> Mesh:
     if not results.has("cloud", frame):
         return EMPTY
     c = results.cloud(frame)
-    return gems(c.positions, c.colors, 0.75 * spacing(c.positions), c.normals)
+    return gems(c.positions, c.shown_colors, 0.75 * spacing(c.positions), c.normals)
 
 
 def bodies(results: Results, frame: int) -> Mesh:
@@ -53,8 +53,7 @@ def bodies(results: Results, frame: int) -> Mesh:
     if not results.has("bodies", frame):
         return EMPTY
     b = results.bodies(frame)
-    assert b.bodies is not None
-    colors = palette.body_colors(b.bodies)
+    colors = palette.body_colors(b.body)
     if results.has("voxels", frame):
         grid = results.voxels(frame)
         indices = np.floor((b.positions - grid.origin) / grid.voxel_size).astype(int)
@@ -66,8 +65,7 @@ def body_skin(results: Results, frame: int, cells: int = 110) -> Mesh:
     """Return a smooth skin around a frame's points in the colours of the bodies, or in one colour without bodies."""
     if results.has("bodies", frame):
         b = results.bodies(frame)
-        assert b.bodies is not None
-        return skin(b.positions, palette.body_colors(b.bodies), cells)
+        return skin(b.positions, palette.body_colors(b.body), cells)
     points = results.any_points(frame)
     return skin(points, np.tile(np.array(GLASS, np.uint8), (len(points), 1)), cells)
 
@@ -87,7 +85,7 @@ def ellipsoids(results: Results, frame: int) -> Mesh:
     return join(
         [
             ellipsoid(
-                e.centers[place, k], e.radii[place, k], e.rotations[place, k], palette.body_color(e.body[k]), level=4
+                e.centers[place, k], e.radii[place, k], e.rotations[place, k], palette.body_color(e.bodies[k]), level=4
             )
             for k in np.flatnonzero(whole)
         ]
@@ -118,12 +116,12 @@ def skeleton(results: Results, frame: int, size: float, outline_points: bool = T
     for body, joint, child in s.bones:
         meshes.append(_bone(s.place(place, body, joint), s.joint_positions[place, child], thick, body))
     for body in s.leaves:
-        joint = int(s.parent_joint[body])
+        joint = int(s.hierarchy.body_joints[body])
         if joint < 0:
             continue
         start, end = s.joint_positions[place, joint], s.body_positions[place, body]
-        if points is not None and points.bodies is not None:
-            end = _far_end(start, end, points.positions[points.bodies == body])
+        if points is not None:
+            end = _far_end(start, end, points.positions[points.body == body])
         meshes.append(_bone(start, end, thick, body))
     for position in s.joint_positions[place]:
         if np.isfinite(position).all():
@@ -151,7 +149,7 @@ def paths(results: Results, size: float, first: int = 0, last: int | None = None
     """Return the paths of the ellipsoids' centres (else of the joints) over places first … last of the sequence."""
     e, s = results.ellipsoids, results.skeleton
     if e is not None:
-        positions, owners = e.centers, e.body
+        positions, owners = e.centers, e.bodies
     elif s is not None:
         positions, owners = s.joint_positions, s.joint_bodies[:, 1]
     else:

@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 import tomli_w
 
+from geomocap.files.check_file import read_self_check
+from geomocap.files.results import read_warnings
 from viz.body_colors import body_color, hex_color
 from viz.quality_figures import Quality
 from viz.report import Block, Section, missing, table, text
-from viz.results import Results
+from viz.run_contents import Results
 
 
 def section(title: str, blocks: list[Block]) -> Section:
@@ -32,9 +34,9 @@ def lead(results: Results) -> str:
         source = "a sequence of geometry" if len(results.frames) > 1 else "a scan"
     e, s = results.ellipsoids, results.skeleton
     if s is not None:
-        return f"From {source} to {s.n_bodies} rigid bodies and {len(s.joint_names)} joints, without a body model."
-    if e is not None and e.n_bodies:
-        return f"From {source} to {e.n_bodies} rigid bodies, without a body model."
+        return f"From {source} to {s.body_count} rigid bodies and {len(s.joint_names)} joints, without a body model."
+    if e is not None and e.body_count:
+        return f"From {source} to {e.body_count} rigid bodies, without a body model."
     if e is not None:
         return f"From {source} to {e.centers.shape[1]} ellipsoids."
     return f"What has been made from {source} so far."
@@ -55,8 +57,8 @@ def key_figures(results: Results) -> tuple[tuple[str, str], ...]:
             figures.append((f"{round(float(results.counts[kind].mean())):,}", label))
     if results.ellipsoids is not None:
         figures.append((str(results.ellipsoids.centers.shape[1]), "ellipsoids"))
-        if results.ellipsoids.n_bodies:
-            figures.append((str(results.ellipsoids.n_bodies), "bodies"))
+        if results.ellipsoids.body_count:
+            figures.append((str(results.ellipsoids.body_count), "bodies"))
     if results.skeleton is not None:
         figures.append((str(len(results.skeleton.joint_names)), "joints"))
     timings = results.run.read_timings()
@@ -87,13 +89,13 @@ def cameras_table(results: Results) -> Block:
 
 def bodies_table(results: Results, frame: int) -> Block:
     """Return the table of bodies: their fraction of the points, ellipsoids and joints."""
-    labels = np.asarray(results.bodies(frame).bodies)
+    labels = results.bodies(frame).body
     e, s = results.ellipsoids, results.skeleton
-    count = int(max(labels.max(initial=-1), -1 if e is None else e.body.max(initial=-1))) + 1
+    count = int(max(labels.max(initial=-1), -1 if e is None else e.bodies.max(initial=-1))) + 1
     rows, colors = [], []
     for body in (*range(count), *([-1] if (labels < 0).any() else [])):
         fraction = f"{100 * float(np.mean(labels == body)):.1f}"
-        own = "" if e is None else str(int((e.body == body).sum()))
+        own = "" if e is None else str(int((e.bodies == body).sum()))
         joints = ""
         if s is not None and body >= 0:
             joints = ", ".join(s.joint_names[j] for j in np.flatnonzero((s.joint_bodies == body).any(axis=1)).tolist())
@@ -109,6 +111,35 @@ def summary(quality: Quality) -> list[Block]:
         return []
     remarks = "One remark" if count == 1 else f"{count} remarks"
     return [text(f"{remarks} on the quality of this run: see the section Quality before you use it.")]
+
+
+def verdict(results: Results) -> list[Block]:
+    """Return what to do with the result, in plain words, from how well it agrees with its own silhouettes."""
+    found = read_self_check(results.run)
+    if found is None:
+        return []
+    word, reasons = found.verdict(tuple(read_warnings(results.run)))
+    words = f"Verdict: {word}."
+    if reasons:
+        return [Block("warnings", items=(words, *reasons))]
+    return [Block("fine", f"{words} Model, cameras and paths agree.")]
+
+
+def agreement_table(results: Results) -> list[Block]:
+    """Return how well the model and the other cameras explain what each camera saw."""
+    found = read_self_check(results.run)
+    if found is None:
+        return []
+    rows = []
+    for name, model, others in zip(found.cameras, found.model, found.left_out, strict=True):
+        rows.append((name, *(_percent(float(np.nanmean(v))) if np.isfinite(v).any() else "–" for v in (model, others))))
+    head = ("camera", "model drawn (%)", "hull of the other cameras (%)")
+    words = (
+        "Intersection over union with the camera's silhouette. The model is drawn in the pose that was found: wrong "
+        "bodies put limbs where no silhouette is. The hull of the others is larger than the subject, the more so the "
+        "fewer cameras there are; a camera that stands out contradicts the others."
+    )
+    return [Block("heading", "Agreement with the cameras"), table(head, rows, (1, 2)), text(words)]
 
 
 def figures_of_quality(results: Results, quality: Quality) -> list[Block]:
@@ -154,6 +185,7 @@ def figures_of_quality(results: Results, quality: Quality) -> list[Block]:
                     "weighs more the thinner the subject."
                 )
             )
+    blocks += agreement_table(results)
     if quality.bones:
         rows = [
             (b.name, f"{1000 * b.mean:.0f}", f"{1000 * b.spread:.1f}", f"{100 * b.spread / b.mean:.1f}")

@@ -13,7 +13,7 @@ from viz.drawing import sheet
 from viz.figures import WIDTH, figure_of, plot
 from viz.rendering import Model
 from viz.report import Block, table
-from viz.results import Results
+from viz.run_contents import Results
 from viz.sheets import VIEWS, picture, tile_size
 from viz.viewpoints import ViewStage
 from viz.volumes import gems, spacing
@@ -62,16 +62,16 @@ def alternatives_sheet(results: Results, stage: ViewStage) -> np.ndarray | None:
     None where the run didn't follow samples.
     """
     found = results.diagnostics
-    if "sample_positions" not in found or "sample_body" not in found:
+    chosen = found.sample_body
+    if found.sample_positions is None or chosen is None:
         return None
-    chosen = found["sample_body"]
     columns = [(f"{_count(chosen)} bodies, as found", chosen)]
-    labels = found.get("alternative_labels", np.zeros((0, len(chosen)), int))
-    for label in labels[:MOST_ALTERNATIVES]:
+    labels = found.alternative_labels
+    for label in () if labels is None else labels[:MOST_ALTERNATIVES]:
         if _count(label) != _count(chosen):
             columns.append((f"{_count(label)} bodies", label))
     frame = results.frames[0]
-    points = found["sample_positions"][:, 0]
+    points = found.sample_positions[:, 0]
     radius = 0.7 * spacing(points)
     tiles: list[list[np.ndarray | None]] = []
     for view in ("three-quarter", "narrow side"):
@@ -91,13 +91,14 @@ def _count(label: np.ndarray) -> int:
 def joints_table(results: Results) -> Block | None:
     """Return the table of joints: ball or hinge, its axis at rest, standard deviation; None where it isn't known."""
     found, skeleton = results.diagnostics, results.skeleton
-    if skeleton is None or "joint_is_hinge" not in found or len(found["joint_is_hinge"]) != len(skeleton.joint_names):
+    kinds, axes = found.joint_is_hinge, found.joint_axes
+    if skeleton is None or kinds is None or axes is None or len(kinds) != skeleton.joint_count:
         return None
-    deviations = found.get("joint_std")  # joints of a known subject's model have none
+    deviations = found.joint_std  # joints of a known subject's model have none
     rows, colors = [], []
     for j, name in enumerate(skeleton.joint_names):
-        hinge = bool(found["joint_is_hinge"][j])
-        axis = ", ".join(f"{v:.2f}" for v in found["joint_axes"][j]) if hinge else ""
+        hinge = bool(kinds[j])
+        axis = ", ".join(f"{v:.2f}" for v in axes[j]) if hinge else ""
         deviation = "" if deviations is None else f"{1000 * float(np.linalg.norm(deviations[j])):.1f}"
         parent, child = skeleton.joint_bodies[j]
         rows.append((name, f"{parent} – {child}", "hinge" if hinge else "ball", axis, deviation))

@@ -12,7 +12,7 @@ from viz import scene
 from viz.drawing import faded, fit, outlined, resize, sheet, write_on
 from viz.floor import floor
 from viz.rendering import Look, Model, render
-from viz.results import Results
+from viz.run_contents import Results
 from viz.shapes import Mesh, frustum
 from viz.viewpoints import PinholeView, ViewStage, camera_view
 

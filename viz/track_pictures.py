@@ -9,10 +9,10 @@ import cv2
 import matplotlib
 import numpy as np
 
-from geomocap.errors import RunError
+from geomocap.model.trajectories import Tracks
 from viz.body_colors import ACCENT, INK
 from viz.drawing import faded, resize, sheet, write_on
-from viz.results import Results
+from viz.run_contents import Results
 from viz.viewpoints import View, ViewStage, camera_view
 
 REMOVED = (200, 30, 50)
@@ -25,52 +25,11 @@ _BEHIND = 0.06  # m behind the nearest one is hidden
 _ARROWS = 450
 
 
-@dataclass(frozen=True)
-class Tracks:
-    """What `tracks.npz` of a run holds, as far as it is drawn.
-
-    Attributes
-    ----------
-    positions, velocities : (N, T, 3) float, metres and m/s
-    unfiltered : (M, T, 3) float, metres
-        All trajectories before the filters; none if the file has none.
-    kept : (N,) int
-        Row of each of `positions` in `unfiltered`.
-    """
-
-    positions: np.ndarray
-    velocities: np.ndarray
-    unfiltered: np.ndarray
-    kept: np.ndarray
-
-
-def read_tracks(results: Results) -> Tracks | None:
-    """Read the tracks of a run; None without any.
-
-    Raises
-    ------
-    RunError
-        If the file is damaged.
-    """
-    if not (results.run.path / "tracks.npz").exists():
-        return None
-    found = results.run.read_npz("tracks.npz", ("positions", "velocities", "unfiltered", "kept"))
-    if not {"positions", "velocities"} <= set(found):
-        raise RunError(
-            f"{results.run.path / 'tracks.npz'}: has no positions and velocities; run `geomocap track` again"
-        )
-    positions = found["positions"].astype(float)
-    unfiltered, kept = found.get("unfiltered", positions[:0]), found.get("kept", np.zeros(0, int))
-    if len(kept) != len(positions) or not (kept < len(unfiltered)).all():
-        unfiltered, kept = positions[:0], kept[:0]
-    return Tracks(positions, found["velocities"].astype(float), unfiltered.astype(float), kept)
-
-
 def trajectory_sheet(
     results: Results, stage: ViewStage, tracks: Tracks, frames: Sequence[int], longest_side: int = 560
 ) -> np.ndarray | None:
     """Draw the trajectories of the last frames before each of `frames`, coloured by displacement: (H, W, 3) uint8."""
-    trails = [_trail(tracks.positions, results.place(f)) for f in frames]
+    trails = [_trail(tracks.trajectories.positions, results.place(f)) for f in frames]
     top = _top(np.concatenate([_displacement(t)[1] for t in trails]))
     row = []
     for frame, trail in zip(frames, trails, strict=True):
@@ -85,17 +44,17 @@ def velocity_sheet(
     results: Results, stage: ViewStage, tracks: Tracks, frames: Sequence[int], longest_side: int = 560
 ) -> np.ndarray | None:
     """Draw velocities as arrows, coloured by speed: (H, W, 3) uint8."""
-    speeds = [np.linalg.norm(tracks.velocities[:, results.place(f)], axis=1) for f in frames]
+    speeds = [np.linalg.norm(tracks.motion.velocities[:, results.place(f)], axis=1) for f in frames]
     top = _top(np.concatenate(speeds))
     row = []
     for frame, speed in zip(frames, speeds, strict=True):
         canvas, view = _background(results, stage, tracks, frame, longest_side)
         which = np.flatnonzero(np.isfinite(speed))
-        start = tracks.positions[which, results.place(frame)]
+        start = tracks.trajectories.positions[which, results.place(frame)]
         which = which[_front(view, start)]
         which = which[:: max(1, len(which) // _ARROWS)]
-        start = tracks.positions[which, results.place(frame)]
-        end = start + _ARROW * tracks.velocities[which, results.place(frame)]
+        start = tracks.trajectories.positions[which, results.place(frame)]
+        end = start + _ARROW * tracks.motion.velocities[which, results.place(frame)]
         colors = _colors(speed[which] / top)
         (a, _), (b, _) = view.project(start), view.project(end)
         for p, q, color in zip(a, b, colors, strict=True):
@@ -110,17 +69,18 @@ def filter_sheet(
     results: Results, stage: ViewStage, tracks: Tracks, frame: int, longest_side: int = 760
 ) -> np.ndarray | None:
     """Draw the trajectories round a frame without filters, what they cut or remove in red, and with them."""
-    if not len(tracks.unfiltered):
+    if tracks.unfiltered is None or tracks.kept is None:
         return None
+    unfiltered = tracks.unfiltered.astype(float)
     place = results.place(frame)
-    left = np.zeros(len(tracks.unfiltered), bool)
-    left[tracks.kept] = np.isfinite(tracks.positions[:, place, 0])
+    left = np.zeros(len(unfiltered), bool)
+    left[tracks.kept] = np.isfinite(tracks.trajectories.positions[:, place, 0])
     tiles = []
-    for name, positions in (("filters off", tracks.unfiltered), ("filters on", tracks.positions)):
+    for name, positions in (("filters off", unfiltered), ("filters on", tracks.trajectories.positions)):
         canvas, view = _background(results, stage, tracks, frame, longest_side)
         trail = _trail(positions, place)
         measured = np.isfinite(positions[:, place, 0])
-        bad = measured & ~left if positions is tracks.unfiltered else np.zeros(len(positions), bool)
+        bad = measured & ~left if positions is unfiltered else np.zeros(len(positions), bool)
         good = measured & ~bad
         canvas = _draw_trails(canvas, view, trail[good], [ACCENT] * int(good.sum()))
         canvas = _draw_trails(canvas, view, trail[bad], [REMOVED] * int(bad.sum()), hide=False)
@@ -139,7 +99,7 @@ def _background(
     if capture is None or not capture.is_calibrated:
         size = (longest_side * 3 // 4, longest_side)
         return np.full((size[1], size[0], 3), 255, np.uint8), stage.at(stage.view(30, 10, size), results.place(frame))
-    seen = tracks.positions[np.isfinite(tracks.positions[:, :, 0])][::50]
+    seen = tracks.trajectories.positions[np.isfinite(tracks.trajectories.positions[:, :, 0])][::50]
     fractions = []
     for c in range(len(capture.rig)):
         view = camera_view(capture.rig, c)

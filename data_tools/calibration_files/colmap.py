@@ -8,6 +8,7 @@ import numpy as np
 
 from data_tools.calibration_files.plausibility import check_rig, in_metres
 from geomocap.errors import RunError
+from geomocap.files.rigs import colmap_model, read_rig
 from geomocap.model.rig import Rig
 
 
@@ -28,7 +29,7 @@ def read_colmap(folder: Path, metres_per_unit: float = 1.0) -> Rig:
     folder = Path(folder)
     places = (folder / "sparse" / "0", folder / "sparse", folder)
     model = next((p for p in places if any(p.glob("cameras.*"))), folder)
-    rig = Rig.read(model)
+    rig = read_rig(model)
     poses = np.array(rig.cam_from_world)
     poses[:, :, 3] = in_metres(poses[:, :, 3], metres_per_unit, str(model))
     rig = Rig(rig.names, rig.cameras, poses)
@@ -48,8 +49,8 @@ def write_colmap(rig: Rig, folder: Path, *, binary: bool = False) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if binary:
-            rig.reconstruction().write_binary(str(folder))
+            colmap_model(rig).write_binary(str(folder))
         else:
-            rig.reconstruction().write_text(str(folder))
+            colmap_model(rig).write_text(str(folder))
     except OSError as error:
         raise RunError(f"{folder}: can't be written ({error.strerror or error})") from None

@@ -15,7 +15,8 @@ import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
-from geomocap.bodies.motion_bodies import MotionBodies, MotionBodiesSettings, find_motion_bodies
+from geomocap.bodies.body_settings import MotionBodiesSettings
+from geomocap.bodies.motion_bodies import MotionBodies, find_motion_bodies
 from geomocap.bodies.rigid_motions import fit_rigid_motion
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.small_systems import solve_symmetric

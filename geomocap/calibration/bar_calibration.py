@@ -33,6 +33,7 @@ from geomocap.calibration.target_observations import TargetObservations
 from geomocap.calibration.verdict import Verdict, judge
 from geomocap.calibration.world import WorldKnowledge
 from geomocap.errors import CalibrationError, RunError
+from geomocap.files.rigs import colmap_model
 from geomocap.model.rig import Rig
 from geomocap.progress import Progress, silent
 
@@ -89,7 +90,7 @@ class Calibration:
 
     def reconstruction(self) -> pycolmap.Reconstruction:
         """Return a COLMAP model: one image `<camera>/000000.png` a camera, the bar ends as points with tracks."""
-        model = self.rig.reconstruction()
+        model = colmap_model(self.rig)
         n = self.adjusted.network
         residual = np.linalg.norm(self.adjusted.residuals, axis=1)
         last = {int(c): v for v, c in enumerate(n.view_camera)}

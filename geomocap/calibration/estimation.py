@@ -84,11 +84,12 @@ def estimate(
     side = observations.sizes.max(axis=1).astype(float)
     C, T = observations.pixels.shape[:2]
     view_of = np.tile(np.arange(C)[:, None], (1, T))
-    for fraction in (0.015, 0.006, 0.004):
+    for fraction in (settings.pairing_threshold, 0.006, 0.004):
         spread = 1.4826 * float(np.median(np.abs(rough.residuals)))
         limit = np.minimum(np.maximum(8 * spread, 1.0), fraction * side)
         chosen = identify(observations, rough.network.interior, poses_of(rough.network), length, limit, view_of=view_of)
-        found = _found_again(observations, chosen, rough.network, view_of, 0.015 * side, settings.seed)
+        widest = settings.pairing_threshold * side
+        found = _found_again(observations, chosen, rough.network, view_of, widest, settings.seed)
         if found is not None:
             rough = replace(rough, network=found)
             chosen = identify(observations, found.interior, poses_of(found), length, limit, view_of=view_of)

@@ -72,7 +72,7 @@ def find_targets(image: np.ndarray, background: np.ndarray, settings: TargetSett
         axes = np.sqrt(np.maximum(np.linalg.eigvalsh(np.atleast_2d(spread)), 1 / 12))
         if axes[1] / axes[0] > 1.5 * settings.max_elongation:
             continue
-        if not fit_disc(image, cx, cy, max(radius, 0.7), 0.8, 4.0, SATURATION, result):
+        if not fit_disc(image, cx, cy, max(radius, settings.min_radius), 0.8, 4.0, SATURATION, result):
             continue
         if result[15] > settings.max_elongation or not settings.min_radius <= result[3] <= largest:
             continue

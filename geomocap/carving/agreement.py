@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geomocap.carving.carving_settings import HullSettings
+from geomocap.carving.carving_settings import ENCLOSING, HullSettings
 from geomocap.carving.hull import hull
 from geomocap.carving.silhouette_views import PinholeViews
 from geomocap.carving.subject_bounds import CELLS, focus, subject_cells
@@ -16,7 +16,6 @@ from geomocap.errors import CalibrationError, GeometryError
 
 LOW_COVERAGE = 0.5  # silhouettes of which half the cameras explain less than this are suspicious
 CLEAR_GAIN = 0.3  # and a camera is to blame if without it the others' coverage is that much higher
-ENOUGH = 4  # cameras that see the subject enclose it, however many others there are
 ALL = HullSettings(outside="empty")  # a point counts where all cameras see it
 
 
@@ -75,7 +74,7 @@ def check_silhouettes(
     empty = [views.names[c] for c in np.flatnonzero(views.blind())]
     left = len(views) - len(empty)
     auto = settings.outside == "auto"
-    if len(empty) <= settings.tolerance or (auto and left >= max(2, min(ENOUGH, (len(views) + 1) // 2))):
+    if len(empty) <= settings.tolerance or (auto and left >= max(2, min(ENCLOSING, (len(views) + 1) // 2))):
         return
     cause = "its image and background"
     if given is not None:
@@ -85,7 +84,7 @@ def check_silhouettes(
         remedy = f"set carving.hull.outside = 'auto', name only the other cameras in capture.toml, or {remedy}"
     raise GeometryError(
         f"frame {frame}: the silhouette of camera {', '.join(empty)} is empty, or nearly so; check {cause}; where the "
-        f"subject is out of sight, {remedy}"
+        f"subject is out of view, {remedy}"
     )
 
 

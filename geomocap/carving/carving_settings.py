@@ -10,6 +10,8 @@ from geomocap.settings import Settings
 
 Point = tuple[float, float, float]
 
+ENCLOSING = 4  # cameras that enclose a subject; the hull of fewer bounds nothing
+
 
 class HullSettings(Settings):
     """When a voxel belongs to the visual hull."""
@@ -19,6 +21,7 @@ class HullSettings(Settings):
         description="what a voxel outside a camera's view is for that camera: empty: background, as in the paper; "
         "unseen: that camera has no say; auto: unseen in the frames in which the camera's silhouette is cut off by the "
         "image's border; a camera whose silhouette is (nearly) empty has no say at all in that frame",
+        json_schema_extra={"flag": "outside"},
     )
     min_views: int = Field(
         default=0,
@@ -36,7 +39,11 @@ class HullSettings(Settings):
 class ConsistencySettings(Settings):
     """Colour consistency of the surface voxels."""
 
-    enabled: bool = Field(default=True, description="carve surface voxels whose colours differ between the cameras")
+    enabled: bool = Field(
+        default=True,
+        description="carve surface voxels whose colours differ between the cameras",
+        json_schema_extra={"flag": "color-consistency"},
+    )
     threshold: float = Field(
         default=8.0, gt=0, description="colour deviation above which a voxel goes (grey values, 0–255)"
     )
@@ -66,11 +73,18 @@ class CarvingSettings(Settings):
         ge=8,
         le=2048,
         description="voxels along the longest side of the subject, or of a given volume (count)",
+        json_schema_extra={"flag": "resolution"},
     )
-    voxel_size: float | None = Field(default=None, gt=0, description="edge of a voxel, instead of resolution (m)")
+    voxel_size: float | None = Field(
+        default=None,
+        gt=0,
+        description="edge of a voxel, instead of resolution (m)",
+        json_schema_extra={"flag": "voxel-size"},
+    )
     volume: tuple[Point, Point] | None = Field(
         default=None,
         description="corners (min, max) of the working volume, world; found from the silhouettes if not given (m)",
+        json_schema_extra={"flag": "volume"},
     )
     margin: float = Field(
         default=0.05, ge=0, le=1, description="added on each side of a found volume (fraction of its side)"

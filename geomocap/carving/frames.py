@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from geomocap.carving.agreement import check_agreement, check_inside, check_silhouettes
@@ -9,11 +11,51 @@ from geomocap.carving.carving_settings import CarvingSettings
 from geomocap.carving.coloring import GREY, voxel_colors
 from geomocap.carving.consistency import carve_inconsistent
 from geomocap.carving.hull import hull
-from geomocap.carving.silhouette_views import PinholeViews
+from geomocap.carving.silhouette_views import PinholeViews, Undistortion
+from geomocap.carving.volume import working_volume
 from geomocap.carving.voxel_grid import Grid
 from geomocap.model.frame_geometry import Voxels
+from geomocap.model.rig import Rig
 
 _DEFAULT = CarvingSettings()
+
+
+def carve(
+    masks: Sequence[np.ndarray],
+    rig: Rig,
+    *,
+    images: Sequence[np.ndarray] | None = None,
+    grid: Grid | None = None,
+    settings: CarvingSettings = _DEFAULT,
+) -> Voxels:
+    """Carve the surface voxels of one frame from its silhouettes.
+
+    Parameters
+    ----------
+    masks : sequence of C arrays (H, W)
+        Silhouettes as the cameras saw them, lens distortion and all; not 0 on the subject.
+    rig : Rig
+        The C cameras.
+    images : sequence of C arrays (H, W, 3) uint8, RGB, optional
+        For the voxels' colours.
+    grid : Grid, optional
+        The block of voxels, the same for all frames of a sequence; found from this frame if not given.
+    settings : CarvingSettings
+
+    Returns
+    -------
+    Voxels
+        `points` (N, 3) m, `colors` (N, 3), `to_open3d()`.
+
+    Raises
+    ------
+    GeometryError
+        If silhouettes are empty or contradict each other.
+    """
+    undistortion = Undistortion.of(rig)
+    views = undistortion.views(masks)
+    straight = undistortion.images(images) if images is not None and needs_images(settings) else None
+    return carve_frame(views, grid or working_volume([views], settings), settings, straight)
 
 
 def carve_frame(

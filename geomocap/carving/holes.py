@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from geomocap.carving.carving_settings import HullSettings
+from geomocap.carving.carving_settings import ENCLOSING, HullSettings
 from geomocap.carving.hull import heard, hull
 from geomocap.carving.silhouette_views import PinholeViews
 from geomocap.carving.subject_bounds import subject_box
@@ -16,7 +16,7 @@ from geomocap.model.rig import Rig
 
 RESOLUTION = 96  # of the others' hull; a hole that matters is many such voxels wide
 SAMPLES = 200  # rays through a hole, and through its rim
-LEAST_OTHERS = 3  # two cameras' hull is too bulky to say where the subject is thick
+LEAST_OTHERS = ENCLOSING - 1  # two cameras' hull is too bulky to say where the subject is thick
 FRACTION = 0.75  # a false hole's rays cross at least this fraction of what its rim's rays cross
 ALL_BUT_ONE = HullSettings(tolerance=1, min_views=LEAST_OTHERS + 1)
 EMPTY, NOBODY = -2, -1  # voxel outside the hull; voxel on which all cameras agree (else: the camera that doesn't)

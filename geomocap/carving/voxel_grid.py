@@ -43,7 +43,7 @@ class Grid:
 
     @classmethod
     def of_box(
-        cls, low: np.ndarray, high: np.ndarray, *, resolution: int = 256, voxel_size: float | None = None
+        cls, low: np.ndarray, high: np.ndarray, *, resolution: int | None = None, voxel_size: float | None = None
     ) -> Grid:
         """Cover a box with cubic voxels.
 
@@ -52,21 +52,27 @@ class Grid:
         low, high : (3,) float
             Corners of the box, metres, world. Where the box is no multiple of a voxel, the grid stands out evenly on
             both sides.
-        resolution : int
+        resolution : int, optional
             Number of voxels along the longest side.
         voxel_size : float, optional
-            Edge of a voxel, metres; then `resolution` is not looked at.
+            Edge of a voxel, metres; then `resolution` is not looked at. One of them has to be given.
 
         Raises
         ------
         GeometryError
             If the box is empty.
+        ValueError
+            If neither resolution nor voxel size is given.
         """
         low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         size = high - low
         if not (np.isfinite(size).all() and (size > 0).all()):
             raise GeometryError(f"the volume from {_show(low)} to {_show(high)} is empty: each max must exceed its min")
-        edge = float(voxel_size) if voxel_size is not None else float(size.max()) / resolution
+        if voxel_size is None:
+            if resolution is None:
+                raise ValueError("a grid needs a resolution or a voxel size")
+            voxel_size = float(size.max()) / resolution
+        edge = float(voxel_size)
         shape = np.maximum(np.ceil(size / edge - 1e-6), 1).astype(int)
         origin = (low + high) / 2 - shape * edge / 2
         return cls(origin, edge, (int(shape[0]), int(shape[1]), int(shape[2])))

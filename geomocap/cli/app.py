@@ -1,44 +1,116 @@
-"""The commands: each opens folders, makes a job, calls the library and shows progress."""
+"""The commands by name; the module of a command is imported when the command is called."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Literal
+from importlib import import_module
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
-import geomocap
-from geomocap import pipeline
-from geomocap.cli import capture_commands as captures
-from geomocap.cli.calibrate_command import calibrate
-from geomocap.cli.evaluate_command import evaluate
-from geomocap.cli.execution import Scheduler, Workers
-from geomocap.cli.export_command import export
-from geomocap.cli.info import info
-from geomocap.cli.jobs import CaptureFolder, ExistingRun, RunFolder, capture_job, scans_job
-from geomocap.cli.keypoint_command import keypoints
-from geomocap.cli.progress_bars import progress_bars
-from geomocap.cli.reports import capture_of, console, review_job, tell_clouds, tell_results
-from geomocap.cli.settings_options import with_file_of_options, with_settings
-from geomocap.config import Config
-from geomocap.files.run import Run
-from viz.picture_files import render_file
-from viz.review import review as review_files
+from geomocap.cli.console import console
+from geomocap.version import __version__
+
+# name: where the command is, and what it does in the words of its own help
+COMMANDS = {
+    "silhouettes": ("stage_commands.silhouettes", "Cut the subject out of all images."),
+    "voxels": (
+        "stage_commands.voxels",
+        "Carve the surface voxels of all frames, silhouettes first where they are missing.",
+    ),
+    "cloud": (
+        "stage_commands.cloud",
+        "Measure the surface by least squares matching: a dense point cloud for each frame.",
+    ),
+    "track": (
+        "stage_commands.track",
+        "Follow points of the surface through all frames: trajectories with velocities and accelerations.",
+    ),
+    "segment": (
+        "stage_commands.segment",
+        "Segment any sequence of scans into rigid bodies, joints and motion; one scan gets its ellipsoids.",
+    ),
+    "run": ("stage_commands.run", "Do everything: from a capture to bodies, skeleton, motion files and report."),
+    "review": ("picture_commands.review", "Make the pictures and the report of a run anew, from its files."),
+    "render": ("picture_commands.render", "Draw any geometry from four sides into a PNG, without a screen."),
+    "synthesize": (
+        "capture_commands.synthesize",
+        "Synthesize a multi-camera capture with ground truth from an animated glTF.",
+    ),
+    "import": ("capture_commands.import_", "Turn another tool's session into a capture."),
+    "demo": (
+        "capture_commands.demo",
+        "Synthesize a small capture of the built-in figure and take it all the way to the report.",
+    ),
+    "calibrate": (
+        "calibrate_command.calibrate",
+        "Calibrate the cameras of a capture with a reference bar; writes CAPTURE/sparse and a report.",
+    ),
+    "convert-calibration": (
+        "capture_commands.convert",
+        "Convert a calibration between the formats of aniposelib, caliscope, Pose2Sim, OpenCV, EasyMocap and COLMAP.",
+    ),
+    "keypoints": (
+        "keypoint_command.keypoints",
+        "Follow key-points on the surface, given as `[[keypoint]]` tables: name, center (m), radius (m), frame.",
+    ),
+    "export": (
+        "export_command.export",
+        "Write motion files of a run for Blender, OpenSim, C3D tools, game engines and plots.",
+    ),
+    "evaluate": (
+        "evaluate_command.evaluate",
+        "Compare a run with the truth: lengths in mm unless a name says otherwise, `%h` is per cent of the height.",
+    ),
+    "info": (
+        "info.info",
+        "Say what a capture, a run, a calibration, a truth, a motion file or scans hold, and what is wrong with them.",
+    ),
+}
+_LOOK: dict[str, Any] = {
+    "add_completion": False,
+    "pretty_exceptions_enable": False,
+    "rich_markup_mode": "markdown",
+    "context_settings": {"help_option_names": ["-h", "--help"]},
+}
+
+
+def load(name: str) -> Any:
+    """Import a command's module and return the command with its options."""
+    from geomocap.cli.settings_options import command_class
+
+    module, _, function = COMMANDS[name][0].rpartition(".")
+    called = getattr(import_module(f"geomocap.cli.{module}"), function)
+    alone = typer.Typer(**_LOOK)
+    alone.command(name, cls=command_class(called))(called)
+    return typer.main.get_command(alone)
+
+
+class _Commands(TyperGroup):
+    """The commands, each a name and a line of help until it is called."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        self.commands.update({name: TyperCommand(name, help=text) for name, (_, text) in COMMANDS.items()})
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args[0] in COMMANDS:
+            self.commands[args[0]] = load(args[0])
+        return super().resolve_command(ctx, args)
+
 
 app = typer.Typer(
     name="geomocap",
+    cls=_Commands,
     help="Motion capture without markers and without a body model, from the geometry alone.",
     no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",
-    context_settings={"help_option_names": ["-h", "--help"]},
+    **_LOOK,
 )
 
 
 def _version(wanted: bool) -> None:
     if wanted:
-        console.print(f"geomocap {geomocap.__version__}")
+        console.print(f"geomocap {__version__}")
         raise typer.Exit
 
 
@@ -49,143 +121,3 @@ def options(
     ] = False,
 ) -> None:
     """Motion capture without markers and without a body model, from the geometry alone."""
-
-
-Fps = Annotated[float, typer.Option("--fps", min=0.001, help="Scans per second.")]
-BODIES = ("segmentation", "skeleton", "nodes", "motion_bodies", "motion_skeleton", "refinement", "following")
-ModelFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--model", metavar="FILE.npz", help="Model of the subject, model.npz of another run: it is followed instead."
-    ),
-]
-Pictures = Annotated[bool, typer.Option(help="Make review pictures and the report.")]
-
-
-@app.command()
-@with_settings("silhouettes")
-def silhouettes(
-    capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
-) -> None:
-    """Cut the subject out of all images."""
-    with capture_job(capture, run, config, workers, scheduler) as job:
-        pipeline.silhouettes(job)
-
-
-@app.command()
-@with_settings("silhouettes", "carving")
-def voxels(
-    capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
-) -> None:
-    """Carve the surface voxels of all frames, silhouettes first where they are missing."""
-    with capture_job(capture, run, config, workers, scheduler) as job:
-        pipeline.voxels(job)
-
-
-@app.command()
-@with_settings("silhouettes", "carving", "cloud")
-def cloud(
-    capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
-) -> None:
-    """Measure the surface by least squares matching: a dense point cloud for each frame."""
-    with capture_job(capture, run, config, workers, scheduler) as job:
-        pipeline.clouds(job)
-    tell_clouds(job.run)
-
-
-@app.command()
-@with_settings("silhouettes", "carving", "tracking", "filters", "smoothing")
-def track(
-    capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
-) -> None:
-    """Follow points of the surface through all frames: trajectories with velocities and accelerations."""
-    with capture_job(capture, run, config, workers, scheduler) as job:
-        pipeline.tracks(job)
-
-
-@app.command()
-@with_settings("scans", *BODIES, "export")
-def segment(
-    scans: Annotated[
-        Path, typer.Argument(metavar="SCANS", help="Folder of scans, or one file (PLY PCD OBJ STL GLB NPZ).")
-    ],
-    run: RunFolder,
-    config: Config,
-    fps: Fps = 30.0,
-    model: ModelFile = None,
-    pictures: Pictures = True,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-) -> None:
-    """Segment any sequence of scans into rigid bodies, joints and motion; one scan gets its ellipsoids."""
-    with scans_job(scans, run, fps, config, workers, scheduler, model) as job:
-        key = pipeline.motion_files(job, "scans")
-        if pictures:
-            review_job(job, key)
-    tell_results(run)
-
-
-@app.command()
-@with_settings("silhouettes", "carving", "cloud", "tracking", "filters", "smoothing", *BODIES, "export")
-def run(
-    capture: CaptureFolder,
-    run: RunFolder,
-    config: Config,
-    source: Annotated[Literal["voxels", "cloud"], typer.Option("--source", help="Geometry to work from.")] = "voxels",
-    model: ModelFile = None,
-    pictures: Pictures = True,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-) -> None:
-    """Do everything: from a capture to bodies, skeleton, motion files and report.
-
-    A run that was stopped goes on where it was; stages whose inputs and settings have not changed are not done again.
-
-    With a model of the subject, saved as model.npz by a run of another sequence, bodies and joints are not looked for:
-    the model is found in this sequence and followed through it.
-
-    Example: `geomocap run CAPTURE RUN --carving.resolution 192`
-    """
-    with capture_job(capture, run, config, workers, scheduler, model) as job:
-        key = pipeline.motion_files(job, source)
-        if pictures:
-            review_job(job, key)
-    if source == "cloud":
-        tell_clouds(job.run)
-    tell_results(run)
-
-
-@app.command()
-@with_file_of_options
-def review(run: ExistingRun, workers: Workers = None) -> None:
-    """Make the pictures and the report of a run anew, from its files."""
-    with progress_bars() as progress:
-        review_files(Run(run), capture_of(Run(run)), progress=progress)
-    tell_results(run)
-
-
-@app.command()
-@with_file_of_options
-def render(
-    geometry: Annotated[
-        Path, typer.Argument(metavar="GEOMETRY", help="Mesh, point cloud or voxel grid: PLY, PCD, OBJ, STL, GLB …")
-    ],
-    picture: Annotated[
-        Path | None, typer.Argument(metavar="PICTURE.png", help="Picture to write; beside the file if not given.")
-    ] = None,
-    up: Annotated[Literal["x", "y", "z"], typer.Option("--up", help="World axis that points up.")] = "z",
-    workers: Workers = None,
-) -> None:
-    """Draw any geometry from four sides into a PNG, without a screen."""
-    console.print(f"picture: {render_file(geometry, picture, up)}")
-
-
-app.command()(captures.synthesize)
-app.command("import")(captures.import_)
-app.command()(captures.demo)
-app.command()(calibrate)
-app.command("convert-calibration")(captures.convert)
-app.command()(keypoints)
-app.command()(export)
-app.command()(evaluate)
-app.command()(info)

@@ -16,10 +16,10 @@ from geomocap.calibration.from_capture import calibrate_capture, up_of, with_l_s
 from geomocap.calibration.observed_points import observations_of, read_observed
 from geomocap.calibration.recording import Recording
 from geomocap.calibration.world import WorldKnowledge
-from geomocap.cli.execution import Workers, executor_for
-from geomocap.cli.jobs import CaptureFolder
+from geomocap.cli.arguments import CaptureFolder, Workers
+from geomocap.cli.console import console
+from geomocap.cli.execution import executor_for
 from geomocap.cli.progress_bars import progress_bars
-from geomocap.cli.reports import console
 from geomocap.cli.settings_options import with_options_of
 from geomocap.errors import CalibrationError, CaptureError, GeomocapError
 from geomocap.files.capture import Capture, read_capture_info

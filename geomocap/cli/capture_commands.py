@@ -16,10 +16,12 @@ from data_tools.importing_calibrations import Format, convert_calibration, impor
 from data_tools.synthesize import SynthesisSettings
 from data_tools.synthesize import synthesize as synthesize_capture
 from geomocap import pipeline
-from geomocap.cli.execution import Workers, executor_for
-from geomocap.cli.jobs import CaptureFolder, capture_job
+from geomocap.cli.arguments import CaptureFolder, Workers
+from geomocap.cli.console import console
+from geomocap.cli.execution import executor_for
+from geomocap.cli.jobs import capture_job
 from geomocap.cli.progress_bars import progress_bars
-from geomocap.cli.reports import console, review_job, tell_results
+from geomocap.cli.reports import review_job, tell_results
 from geomocap.cli.settings_options import with_file_of_options, with_options_of
 from geomocap.config import Config
 

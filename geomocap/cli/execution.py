@@ -5,26 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from typing import Annotated
-
-import typer
 
 from geomocap.errors import SettingsError
-from geomocap.scheduling import limit_threads, threads
-
-
-def _limited(workers: int | None) -> int | None:
-    limit_threads(workers)
-    return workers
-
-
-Workers = Annotated[
-    int | None,
-    typer.Option("--workers", min=1, callback=_limited, help="Threads to use; one for each core if not given."),
-]
-Scheduler = Annotated[
-    str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to map frames on, tcp://host:8786.")
-]
+from geomocap.scheduling import threads
 
 
 @contextmanager

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from geomocap.cli.execution import Workers
+from geomocap.cli.arguments import Workers
+from geomocap.cli.console import console
 from geomocap.cli.progress_bars import progress_bars
-from geomocap.cli.reports import console
 from geomocap.cli.settings_options import with_settings
 from geomocap.config import Config
 from geomocap.export.names import Names
@@ -21,14 +21,14 @@ from geomocap.files.run import Run
 def export(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder with skeleton.npz.")],
     config: Config,
-    bvh: Annotated[bool, typer.Option("--bvh", help="BVH: y up, metres or centimetres (--export.bvh_unit).")] = False,
-    trc: Annotated[bool, typer.Option("--trc", help="TRC: y up, mm or m (--export.trc_unit).")] = False,
+    bvh: Annotated[bool, typer.Option("--bvh", help="BVH: y up, metres or centimetres (--bvh-unit).")] = False,
+    trc: Annotated[bool, typer.Option("--trc", help="TRC: y up, mm or m (--trc-unit).")] = False,
     c3d: Annotated[bool, typer.Option("--c3d", help="C3D: z up, mm; needs the extra c3d.")] = False,
     glb: Annotated[bool, typer.Option("--glb", help="GLB: y up, m.")] = False,
     usd: Annotated[bool, typer.Option("--usd", help="USD (UsdSkel): y up, m; needs the extra usd.")] = False,
     csv: Annotated[bool, typer.Option("--csv", help="CSV: world axes, m and degrees.")] = False,
     parquet: Annotated[bool, typer.Option("--parquet", help="Parquet, as CSV; needs the extra parquet.")] = False,
-    with_skin: Annotated[bool, typer.Option("--skin", help="The same as --export.surface skin.")] = False,
+    with_skin: Annotated[bool, typer.Option("--skin", help="The same as --surface skin.")] = False,
     names: Annotated[
         Path | None,
         typer.Option("--names", metavar="FILE.toml", help="Names: thigh_left = 3 …; RUN/names.toml if not given."),
@@ -42,7 +42,7 @@ def export(
 
     Without a format all are written whose packages are installed.
 
-    Example: `geomocap export RUN --glb --skin --export.skin_colors true`
+    Example: `geomocap export RUN --glb --skin --skin-colors true`
     """
     asked = {"bvh": bvh, "trc": trc, "c3d": c3d, "glb": glb, "usd": usd, "csv": csv, "parquet": parquet}
     formats = [name for name, wanted in asked.items() if wanted] or None
@@ -65,6 +65,4 @@ def report_exported(exported: Exported) -> None:
     console.print(f"largest deviation from skeleton.npz: {exported.deviation_mm:.3f} mm")
     if exported.moving_joints:
         count = len(exported.moving_joints)
-        console.print(
-            f"{count} joints are not fixed in their bodies; they shift in every frame (or --export.joints fixed)"
-        )
+        console.print(f"{count} joints are not fixed in their bodies; they shift in every frame (or --joints fixed)")

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from geomocap.cli.execution import Workers
-from geomocap.cli.reports import console
+from geomocap.cli.arguments import Workers
+from geomocap.cli.console import console
 from geomocap.cli.settings_options import with_file_of_options
 from geomocap.inspection import describe
 

@@ -5,9 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from geomocap.cli.execution import executor_for
 from geomocap.cli.progress_bars import progress_bars
@@ -18,10 +15,6 @@ from geomocap.files.run import Run
 from geomocap.files.scans import open_scans
 from geomocap.pipeline.job import Job
 from geomocap.subject.subject_model import MODEL_FILE, read_model
-
-CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder, with capture.toml.")]
-RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder; made if it isn't there.")]
-ExistingRun = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of `geomocap run`, `track` or `segment`.")]
 
 
 @contextmanager

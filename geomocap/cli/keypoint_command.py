@@ -9,17 +9,18 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from geomocap.cli.execution import Workers
+from geomocap.cli.arguments import ExistingRun, Workers
+from geomocap.cli.console import console
 from geomocap.cli.export_command import report_exported
-from geomocap.cli.jobs import ExistingRun
-from geomocap.cli.reports import capture_of, console
+from geomocap.cli.reports import capture_of
 from geomocap.cli.settings_options import with_file_of_options
 from geomocap.errors import GeomocapError
 from geomocap.export.run_export import export_run
+from geomocap.files.results import SKELETON, read_followed
 from geomocap.files.run import Run
 from geomocap.keypoints.keypoint_following import Measured
 from geomocap.keypoints.keypoint_regions import KeyPointFile, read_keypoints, write_keypoints
-from geomocap.pipeline.keypoint_stage import FollowedKeyPoints, clear_results, run_fps, run_trajectories
+from geomocap.pipeline.keypoint_stage import FollowedKeyPoints, clear_results, run_fps
 from geomocap.pipeline.keypoint_stage import keypoints as follow_keypoints
 
 
@@ -61,9 +62,9 @@ def _edit(run: Run, file: Path, host: str, port: int) -> None:
     from viz.keypoint_editor import KeyPointEditor
     from viz.keypoint_scene import Subject
     from viz.keypoint_session import Follower, Session
-    from viz.results import Results
+    from viz.run_contents import Results
 
-    tracks = run_trajectories(run)
+    tracks = read_followed(run)
     begun = read_keypoints(file) if file.exists() else KeyPointFile()
     subject = Subject(Results(run, capture_of(run)), tracks.positions, run_fps(run))
 
@@ -93,9 +94,9 @@ def _edit(run: Run, file: Path, host: str, port: int) -> None:
 
 def _report(run: Run, file: KeyPointFile, found: FollowedKeyPoints) -> None:
     """Print how far each key-point was followed and what was written; write the run's motion files anew."""
-    present = np.isfinite(found.paths.positions[:, :, 0])
+    present = np.isfinite(found.points.paths.positions[:, :, 0])
     for k, point in enumerate(file.keypoint):
-        bridged = int((found.paths.bridged[:, k] & present[:, k]).sum())
+        bridged = int((found.points.paths.bridged[:, k] & present[:, k]).sum())
         console.print(
             f"{point.name}: followed in {present[:, k].sum()} of {len(present)} frames, {bridged} of them bridged",
             markup=False,
@@ -104,5 +105,5 @@ def _report(run: Run, file: KeyPointFile, found: FollowedKeyPoints) -> None:
         console.print(f"{path}", markup=False)
     for reason in found.skipped:
         console.print(f"not written: {reason}", markup=False)
-    if (run.path / "skeleton.npz").exists():
+    if run.has(SKELETON):
         report_exported(export_run(run))

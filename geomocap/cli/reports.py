@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
-from rich.console import Console
-
+from geomocap.cli.console import console
 from geomocap.errors import GeomocapError
 from geomocap.files.atomic import fingerprint
 from geomocap.files.capture import Capture
+from geomocap.files.results import read_cloud_record
 from geomocap.files.run import Run, stage_key
-from geomocap.pipeline.cloud_stage import read_cloud_record
+from geomocap.pipeline.cloud_stage import measure_again
 from geomocap.pipeline.job import Job
+from geomocap.progress import Progress, silent
 from viz.review import review
-
-console = Console(highlight=False, soft_wrap=True)
 
 
 def review_job(job: Job, made_from: str) -> None:
@@ -25,9 +25,14 @@ def review_job(job: Job, made_from: str) -> None:
     made_from : str
         Key of the last stage that the report shows.
     """
-    code = fingerprint([Path(review.__code__.co_filename).parent])
-    key = stage_key("review", made_from, job.up, code, sorted(job.run.read_timings()))
-    job.stage("review", key, ["review"], lambda: len(review(job.run, job.capture, progress=job.progress)))
+    templates = fingerprint([Path(review.__code__.co_filename).parent / "templates"])
+    key = stage_key(review.__module__, "review", made_from, job.up, templates, sorted(job.run.read_timings()))
+    job.stage("review", key, ["review"], lambda: len(review_run(job.run, job.capture, job.progress)))
+
+
+def review_run(run: Run, capture: Capture | None, progress: Progress = silent) -> list[Path]:
+    """Make pictures and report of a run, with a frame's surface measured again where it was measured."""
+    return review(run, capture, measured=partial(measure_again, run, capture), progress=progress)
 
 
 def capture_of(run: Run) -> Capture | None:

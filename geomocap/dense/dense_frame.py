@@ -13,7 +13,7 @@ from geomocap.dense.cloud_merging import CloudLayer, merge
 from geomocap.dense.dense_settings import CloudSettings
 from geomocap.dense.intersection import intersect
 from geomocap.dense.match_evidence import MatchEvidence, evidence_of
-from geomocap.dense.match_groups import MatchGroup, MatchGroups
+from geomocap.dense.match_groups import MatchGroup, MatchGroups, match_groups
 from geomocap.dense.matching_images import PreparedImages, prepare
 from geomocap.dense.measured_points import MeasuredPoints
 from geomocap.dense.search_bounds import Box, depth_range, inside_silhouettes
@@ -83,6 +83,29 @@ class CloudFrame:
     def cloud(self) -> o3d.t.geometry.PointCloud:
         """The cloud as Open3D holds it."""
         return self.points.to_open3d()
+
+
+def measure_cloud(
+    images: Sequence[np.ndarray],
+    rig: Rig,
+    *,
+    masks: Sequence[np.ndarray] | None = None,
+    hull: Voxels | None = None,
+    settings: CloudSettings | None = None,
+    box: Box | None = None,
+) -> CloudFrame:
+    """Measure the surface that the images of one frame show, by dense least squares matching.
+
+    Parameters and errors are those of `cloud_of_frame`; cameras are grouped by their geometry.
+
+    Returns
+    -------
+    CloudFrame
+        `points.positions` (N, 3) m with normals, colours and quality; `cloud` is the Open3D point cloud.
+    """
+    settings = settings or CloudSettings()
+    groups = match_groups(rig, settings.groups, box)
+    return cloud_of_frame(images, masks, hull, rig, groups, settings, box)
 
 
 def cloud_of_frame(

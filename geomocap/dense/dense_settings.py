@@ -6,8 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from geomocap.matching.matching_settings import GrowingSettings, KernelSettings, SeedSettings
-from geomocap.matching.wallis import WallisSettings
+from geomocap.matching.matching_settings import GrowingSettings, KernelSettings, SeedSettings, WallisSettings
 from geomocap.settings import Settings
 
 
@@ -15,7 +14,9 @@ class GroupSettings(Settings):
     """Which cameras are matched with each other."""
 
     templates: Literal["auto", "one", "all"] = Field(
-        "auto", description="one: the most central camera; all: every camera; auto: one up to three cameras"
+        "auto",
+        description="one: the most central camera; all: every camera; auto: one up to three cameras",
+        json_schema_extra={"flag": "templates"},
     )
     template_camera: str | None = Field(
         None, description="the template if there is only one; the most central if not given"
@@ -24,8 +25,8 @@ class GroupSettings(Settings):
     least_angle: float = Field(6.0, ge=0, lt=90, description="least angle between viewing directions (degrees)")
     best_angle: float = Field(25.0, gt=0, lt=90, description="angle between viewing directions aimed at (degrees)")
     greatest_angle: float = Field(60.0, gt=0, lt=120, description="greatest angle between viewing directions (degrees)")
-    near: float = Field(0.5, gt=0, description="least depth where nothing else bounds it, in distances of the scene")
-    far: float = Field(1.6, gt=0, description="greatest depth, likewise")
+    near: float = Field(0.5, gt=0, description="least depth where nothing else bounds it (fraction of the scene's)")
+    far: float = Field(1.6, gt=0, description="greatest depth, likewise (fraction of the scene's)")
 
 
 class MergeSettings(Settings):
@@ -68,15 +69,20 @@ class CloudSettings(Settings):
     trust: TrustSettings = Field(default_factory=TrustSettings, description="when matches are believed")
     merge: MergeSettings = Field(default_factory=MergeSettings, description="how clouds become one")
     bounds: Literal["auto", "hull", "silhouettes", "none"] = Field(
-        "auto", description="what bounds the search; auto: the most that cameras, masks and backgrounds allow"
+        "auto",
+        description="what bounds the search; auto: the most that cameras, masks and backgrounds allow",
+        json_schema_extra={"flag": "bounds"},
     )
     spacing: float | None = Field(
-        None, gt=0, description="distance of neighbouring points on the surface, instead of growing.step (m)"
+        None,
+        gt=0,
+        description="distance of neighbouring points on the surface, instead of growing.step (m)",
+        json_schema_extra={"flag": "cloud-spacing"},
     )
     least_views: int = Field(2, ge=2, description="cameras that have to see a point, the template included")
     contour_margin: int = Field(1, ge=0, description="pixels along a silhouette's contour that are not used (px)")
     silhouette_margin: int = Field(3, ge=0, description="how far points may project outside other silhouettes (px)")
     hull_depth: float = Field(
-        0.1, gt=0, description="how far behind the hull's front the surface is sought, in diagonals of the hull"
+        0.1, gt=0, description="how far behind the hull's front the surface is sought (diagonals of the hull)"
     )
     normal_radius: int = Field(1, ge=0, le=5, description="cells around a point whose slopes make its normal")

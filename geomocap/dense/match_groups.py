@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from geomocap.errors import CalibrationError
 from geomocap.matching.epipolar import transfers
 from geomocap.model.rig import Rig
 
-_PARALLEL = 0.0012  # squared sine of two degrees: axes that differ less from their mean don't meet in a scene
+_PARALLEL = math.sin(math.radians(2.0)) ** 2  # axes that differ less from their mean don't meet in a scene
 _ANYWHERE = (0.15, 6.0)  # bounds of the depth where axes don't meet, in distances of the scene
 
 

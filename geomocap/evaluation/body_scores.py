@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomocap.evaluation.result import Curve, Evaluation
-from geomocap.evaluation.surfaces import read_labelled
 from geomocap.evaluation.truth import Truth
+from geomocap.files.frame_files import read_points
 from geomocap.files.run import Run
 
 CORE_WEIGHT = 0.8  # a surface point belongs to a body's core when the body's skin weight there is at least this much
@@ -44,7 +44,8 @@ class LabelledFrame:
 
 def labelled_frame(run: Run, truth: Truth, frame: int) -> LabelledFrame:
     """Read a frame's bodies, and find the true body at the closest surface point of each."""
-    points, found = read_labelled(run, "bodies", frame)
+    read = read_points(run.frame_file("bodies", frame))
+    points, found = read.positions, read.body
     closest, face, corners, _ = truth.surface(frame).closest(points)
     distance = np.linalg.norm(closest - points, axis=1)
     near = distance < NEAR_FRACTION * truth.height

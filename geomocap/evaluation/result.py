@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomocap.errors import GeomocapError
+from geomocap.model.rotations import turn_angles
 
 
 class EvaluationError(GeomocapError):
@@ -71,7 +72,7 @@ class Alignment:
     @property
     def angle_deg(self) -> float:
         """Angle of the rotation."""
-        return float(np.rad2deg(np.arccos(np.clip((np.trace(self.rotation) - 1) / 2, -1, 1))))
+        return float(np.rad2deg(turn_angles(self.rotation)))
 
 
 @dataclass(frozen=True)

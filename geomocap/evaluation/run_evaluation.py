@@ -14,6 +14,7 @@ from geomocap.evaluation.track_scores import judge_tracks
 from geomocap.evaluation.truth import Truth
 from geomocap.export.conventions import Axis, Unit
 from geomocap.export.run_export import run_markers, run_up
+from geomocap.files.results import SKELETON, TRACKS, read_skeleton, read_trajectories
 from geomocap.files.run import Run
 from geomocap.progress import Progress, silent
 
@@ -60,8 +61,7 @@ def evaluate(
     if truth.is_dir() or truth.suffix.lower() == ".npz":
         return evaluate_synthetic(Run(run), Truth.read(truth), settings, progress=progress)
     opened = Run(run)
-    skeleton = opened.read_npz("skeleton.npz")
-    found = run_markers(opened, skeleton, None, run_up(opened), ellipsoids=False)
+    found = run_markers(opened, read_skeleton(opened), None, run_up(opened), ellipsoids=False)
     other = read_motion_file(truth, unit=unit, up=up)
     return compare_markers(found, other, settings, matches=read_matches(matches) if matches else None)
 
@@ -85,13 +85,13 @@ def evaluate_synthetic(
     bodies, votes = judge_bodies(run, truth, frames)
     parts.append(bodies)
     progress("evaluate", 3, 5)
-    if (run.path / "skeleton.npz").is_file():
-        skeleton = run.read_npz("skeleton.npz")
-        _check_rate(run, float(skeleton["fps"]), truth)
+    if run.has(SKELETON):
+        skeleton = read_skeleton(run)
+        _check_rate(run, skeleton.fps, truth)
         parts.append(judge_skeleton(skeleton, truth, votes))
     progress("evaluate", 4, 5)
-    if (run.path / "tracks.npz").is_file():
-        parts.append(judge_tracks(run.read_npz("tracks.npz", ["positions"])["positions"], truth))
+    if run.has(TRACKS):
+        parts.append(judge_tracks(read_trajectories(run).positions, truth))
     progress("evaluate", 5, 5)
     figures: dict[str, float] = {"truth.bodies": len(truth.bodies), "truth.height_m": round(truth.height, 3)}
     for part in parts:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from geomocap.evaluation.result import Curve, Evaluation, Match
 from geomocap.evaluation.truth import Truth
-from geomocap.model.rotations import turn_angles
+from geomocap.model.rotations import relative_turns, turn_angles
+from geomocap.model.skeleton import Skeleton
 
 FOUND_WITHIN, WELL_WITHIN, CAP = 0.10, 0.05, 0.15  # fractions of the height
 LOST = 10.0  # heights: what a joint without a position counts as
 
 
-def judge_skeleton(skeleton: Mapping[str, np.ndarray], truth: Truth, votes: np.ndarray | None) -> Evaluation:
+def judge_skeleton(skeleton: Skeleton, truth: Truth, votes: np.ndarray | None) -> Evaluation:
     """Compare a run's skeleton with the true one.
 
     Joints are matched one to one by their mean distance over time. A true joint counts as found when its partner's mean
@@ -23,14 +22,12 @@ def judge_skeleton(skeleton: Mapping[str, np.ndarray], truth: Truth, votes: np.n
 
     Parameters
     ----------
-    skeleton : mapping
-        Arrays of `skeleton.npz`.
+    skeleton : Skeleton
     truth : Truth
     votes : (true bodies, found bodies) int, optional
         From `judge_bodies`; without it connections and rotations aren't judged.
     """
-    positions = skeleton["joint_positions"].astype(float)
-    joint_bodies = skeleton["joint_bodies"].astype(int).reshape(-1, 2)
+    positions = skeleton.joint_positions
     T = min(len(positions), truth.n_frames)
     active = truth.bodies.jointed
     if T == 0 or len(active) == 0:
@@ -62,18 +59,17 @@ def judge_skeleton(skeleton: Mapping[str, np.ndarray], truth: Truth, votes: np.n
         figures["joints.p95_error"] = np.percentile(each, 95) * 1000
         figures["joints.jitter_second_difference"] = float(np.mean(jitter)) * 1000
         curves.append(Curve("joints: mean distance from the true ones", "mm", np.arange(T), each.mean(axis=0) * 1000))
-        found_names = _names(skeleton, positions.shape[1])
         for (i, j), d in zip(pairs, each, strict=True):
             name = str(truth.joint_names[truth.bodies.root[active[j]]])
             seen = int(np.isfinite(positions[:, i, 0]).sum())
-            matches.append(Match(found_names[i], name, d.mean() * 1000, np.percentile(d, 95) * 1000, seen))
-            curves.append(Curve(f"joint {name}: distance of {found_names[i]}", "mm", np.arange(T), d * 1000))
+            found = str(skeleton.joint_names[i])
+            matches.append(Match(found, name, d.mean() * 1000, np.percentile(d, 95) * 1000, seen))
+            curves.append(Curve(f"joint {name}: distance of {found}", "mm", np.arange(T), d * 1000))
     if votes is not None:
-        figures |= _judge_edges(joint_bodies, truth, votes)
-        if "body_rotations" in skeleton:
-            turned = _judge_rotations(skeleton["body_rotations"].astype(float)[:T], truth, votes)
-            figures |= turned.figures
-            curves += turned.curves
+        figures |= _judge_edges(skeleton.joint_bodies, truth, votes)
+        turned = _judge_rotations(skeleton.body_rotations[:T], truth, votes)
+        figures |= turned.figures
+        curves += turned.curves
     return Evaluation(figures, tuple(curves), tuple(matches))
 
 
@@ -82,10 +78,6 @@ def _jitter(difference: np.ndarray) -> float:
     if len(difference) <= 2:
         return 0.0
     return float(np.linalg.norm(np.diff(difference, n=2, axis=0), axis=1).mean())
-
-
-def _names(skeleton: Mapping[str, np.ndarray], n: int) -> list[str]:
-    return [str(x) for x in skeleton["joint_names"]] if "joint_names" in skeleton else [f"joint{j}" for j in range(n)]
 
 
 def _judge_edges(joint_bodies: np.ndarray, truth: Truth, votes: np.ndarray) -> dict[str, float]:
@@ -115,7 +107,7 @@ def _judge_rotations(rotations: np.ndarray, truth: Truth, votes: np.ndarray) -> 
             continue
         root = int(truth.bodies.root[b])
         true = _since_first(truth.joint_rotations[:T, root])
-        error = np.rad2deg(turn_angles(np.einsum("tji,tjk->tik", true, _since_first(rotations[:, k]))))
+        error = np.rad2deg(turn_angles(relative_turns(true, _since_first(rotations[:, k]))))
         errors.append(error.mean())
         curves.append(Curve(f"body {truth.joint_names[root]}: rotation error", "°", np.arange(T), error))
     if not errors:

@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-import open3d as o3d
 from scipy.spatial import cKDTree
 
-from geomocap.evaluation.result import Curve, Evaluation, EvaluationError
+from geomocap.evaluation.result import Curve, Evaluation
 from geomocap.evaluation.truth import Truth
-from geomocap.files.open3d_geometry import read_by_open3d
+from geomocap.files.frame_files import read_points, read_voxels
 from geomocap.files.run import Run
-from geomocap.model.frame_geometry import Voxels
 
 NEAR_MM = 10.0
 
@@ -60,18 +58,4 @@ def read_geometry(run: Run, kind: Literal["voxels", "cloud"], frame: int) -> np.
     file = run.frame_file(kind, frame)
     if not file.is_file():
         return None
-    if kind == "voxels":
-        return Voxels.read(file).points
-    return read_labelled(run, kind, frame)[0]
-
-
-def read_labelled(run: Run, kind: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a frame's points, (N, 3) metres, and their bodies, (N,) int, -1 where there are none."""
-    file = run.frame_file(kind, frame)
-    cloud = read_by_open3d(o3d.t.io.read_point_cloud, file)
-    if "positions" not in cloud.point:
-        raise EvaluationError(f"{file}: no readable points; delete it and run again")
-    points = cloud.point.positions.numpy().astype(float)
-    if "body" not in cloud.point:
-        return points, np.full(len(points), -1)
-    return points, cloud.point["body"].numpy().ravel().astype(int)
+    return read_voxels(file).points if kind == "voxels" else read_points(file).positions

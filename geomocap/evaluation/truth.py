@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from geomocap.errors import RunError
 from geomocap.evaluation.result import EvaluationError
+from geomocap.files.npz import read_npz
 from geomocap.model.ray_casting import TriangleScene
-from geomocap.model.rotations import turn_angles
+from geomocap.model.rotations import relative_turns, turn_angles
 
 ACTIVE_DEG = 15.0  # a rig joint is active when its segment turns at least this much against its parent segment
 MIN_FRACTION = 0.012  # a segment with a smaller fraction of the surface (fingers, eyes) belongs to its parent's body
@@ -93,13 +95,12 @@ class Truth:
             If the file is missing, damaged, lacks arrays, or holds NaN, no frames or lengths that are no metres.
         """
         file = path / "truth.npz" if path.is_dir() else path
+        if not file.is_file():
+            raise EvaluationError(f"{file}: missing; a truth is a folder with truth.npz, or a motion file")
         try:
-            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
-                arrays = dict(data)
-        except FileNotFoundError:
-            raise EvaluationError(f"{file}: missing; a truth is a folder with truth.npz, or a motion file") from None
-        except Exception as error:
-            raise EvaluationError(f"{file}: damaged ({error}); make it again") from None
+            arrays = read_npz(file)
+        except RunError:
+            raise EvaluationError(f"{file}: damaged; make it again") from None
         _check(arrays, file)
         weights = arrays.get("vertex_weights")
         return cls(
@@ -201,7 +202,7 @@ def _parents_first(parents: np.ndarray) -> list[int]:
 
 
 def _largest_turn_deg(rotations: np.ndarray, reference: int, joint: int) -> float:
-    relative = np.einsum("tji,tjk->tik", rotations[:, reference], rotations[:, joint])
+    relative = relative_turns(rotations[:, reference], rotations[:, joint])
     since_first = np.einsum("ij,tkj->tik", relative[0], relative)
     return float(np.rad2deg(turn_angles(since_first)).max())
 

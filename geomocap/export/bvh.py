@@ -17,9 +17,9 @@ import numpy as np
 
 from geomocap.export.conventions import BVH, Axis, Convention
 from geomocap.export.export_errors import MotionError
-from geomocap.export.file_rotations import rotation_about, zxy_angles
 from geomocap.export.motion_tree import MotionTree
 from geomocap.files.atomic import write_text
+from geomocap.model.rotations import rotation_about, zxy_angles
 
 ROTATION_CHANNELS = ("Zrotation", "Xrotation", "Yrotation")
 POSITION_CHANNELS = ("Xposition", "Yposition", "Zposition")

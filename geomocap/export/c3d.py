@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-import geomocap
 from geomocap.export.conventions import C3D, UNITS_PER_METRE, Axis
 from geomocap.export.export_errors import MotionError, require
 from geomocap.export.markers import Markers
 from geomocap.export.motion_tree import MotionTree
 from geomocap.files.atomic import write_atomic
+from geomocap.version import __version__
 
 FINEST_RESIDUAL = 0.01  # mm; residuals are bytes, multiples of POINT:SCALE
 LABELS_PER_PARAMETER = 255  # a dimension of a C3D parameter is a byte
@@ -55,7 +55,7 @@ def write_c3d(path: Path, markers: Markers, motion: MotionTree | None = None) ->
     file.add_parameter("POINT", "X_SCREEN", ["+X"])
     file.add_parameter("POINT", "Y_SCREEN", [f"+{C3D.up.upper()}"])
     file.add_parameter("MANUFACTURER", "COMPANY", ["geomocap"])
-    file.add_parameter("MANUFACTURER", "SOFTWARE", [f"geomocap {geomocap.__version__}"])
+    file.add_parameter("MANUFACTURER", "SOFTWARE", [f"geomocap {__version__}"])
     file["data"]["points"] = points
     file["data"]["meta_points"] = {
         "residuals": residuals.T[None],

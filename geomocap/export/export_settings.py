@@ -16,22 +16,37 @@ class ExportSettings(Settings):
         "auto",
         description="fixed: constant offsets between joints; moving: every joint shifts in every frame; auto: only "
         "those joints shift that no constant offset reproduces within 0.01 mm",
+        json_schema_extra={"flag": "joints"},
     )
-    bvh_unit: Literal["m", "cm"] = Field("m", description="unit of BVH files, which can't say it themselves")
-    trc_unit: Literal["mm", "m"] = Field("mm", description="unit of TRC files, stated in their header")
-    ellipsoids: bool = Field(True, description="whether the ellipsoids' centres are markers, too")
+    bvh_unit: Literal["m", "cm"] = Field(
+        "m", description="unit of BVH files, which can't say it themselves", json_schema_extra={"flag": "bvh-unit"}
+    )
+    trc_unit: Literal["mm", "m"] = Field(
+        "mm", description="unit of TRC files, stated in their header", json_schema_extra={"flag": "trc-unit"}
+    )
+    ellipsoids: bool = Field(
+        True, description="whether the ellipsoids' centres are markers, too", json_schema_extra={"flag": "ellipsoids"}
+    )
     surface: Literal["auto", "bones", "skin"] = Field(
         "auto",
         description="what GLB and USD show: a bone for each body, or the subject's own surface; auto: the surface "
         "where the run has the subject's model",
+        json_schema_extra={"flag": "surface"},
     )
     skin_frame: int = Field(
-        0, ge=0, description="reference frame whose surface is taken; a subject's model is used for frame 0"
+        0,
+        ge=0,
+        description="reference whose surface is taken (frame); a subject's model is used for frame 0",
+        json_schema_extra={"flag": "skin-frame"},
     )
     skin_colors: Literal["body", "true"] = Field(
-        "body", description="colour the surface by body, or by its own colours"
+        "body",
+        description="colour the surface by body, or by its own colours",
+        json_schema_extra={"flag": "skin-colors"},
     )
-    skin_triangles: int = Field(50000, ge=500, description="triangles of the surface at most")
+    skin_triangles: int = Field(
+        50000, ge=500, description="triangles of the surface at most", json_schema_extra={"flag": "skin-triangles"}
+    )
     skin_blend: float = Field(
         0.02,
         gt=0,

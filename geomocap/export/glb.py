@@ -13,10 +13,10 @@ import numpy as np
 import pygltflib as gltf
 
 from geomocap.export.conventions import GLB
-from geomocap.export.file_rotations import quaternions
 from geomocap.export.motion_tree import MotionTree
 from geomocap.export.skinned_mesh import SkinnedMesh, bone_mesh
 from geomocap.files.atomic import write_atomic
+from geomocap.model.rotations import quaternions
 
 _COMPONENT = {np.dtype(np.float32): gltf.FLOAT, np.dtype(np.uint16): gltf.UNSIGNED_SHORT}
 _COMPONENT[np.dtype(np.uint32)] = gltf.UNSIGNED_INT

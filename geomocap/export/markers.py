@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +9,9 @@ import numpy as np
 from geomocap.export.conventions import Axis
 from geomocap.export.export_errors import MotionError
 from geomocap.export.names import Names
+from geomocap.model.ellipsoids import Ellipsoids
+from geomocap.model.keypoint_paths import KeyPoints
+from geomocap.model.skeleton import Skeleton
 
 LEAST_RESIDUAL = 0.0001  # m; 0 stands for points that were not measured
 
@@ -69,10 +71,10 @@ class Markers:
 
 
 def markers_from_run(
-    skeleton: Mapping[str, np.ndarray],
+    skeleton: Skeleton,
     *,
-    ellipsoids: Mapping[str, np.ndarray] | None = None,
-    keypoints: Mapping[str, np.ndarray] | None = None,
+    ellipsoids: Ellipsoids | None = None,
+    keypoints: KeyPoints | None = None,
     names: Names | None = None,
     up: Axis = "z",
 ) -> Markers:
@@ -82,39 +84,35 @@ def markers_from_run(
 
     Parameters
     ----------
-    skeleton, ellipsoids, keypoints : mapping
-        Arrays of `skeleton.npz`, `ellipsoids.npz`, `keypoints.npz`.
+    skeleton : Skeleton
+    ellipsoids : Ellipsoids, optional
+    keypoints : KeyPoints, optional
     names : Names, optional
         The user's names.
     up : "x", "y" or "z"
     """
     names = names or Names()
-    joint_bodies = np.asarray(skeleton["joint_bodies"], int).reshape(-1, 2)
-    joints = np.asarray(skeleton["joint_positions"], float)
-    n_frames, n_bodies = skeleton["body_positions"].shape[:2]
-    body_names = names.body_names(n_bodies, _texts(skeleton, "body_names"))
-    labels = list(names.joint_names(joint_bodies, body_names, _texts(skeleton, "joint_names")))
-    told = [f"joint between {body_names[a]} and {body_names[b]}" for a, b in joint_bodies]
-    positions = [joints.reshape(n_frames, -1, 3)]
-    residuals = [np.full((n_frames, len(labels)), np.nan)]
+    count = skeleton.body_count
+    body_names = names.body_names(count, skeleton.body_names)
+    labels = list(names.joint_names(skeleton.joint_bodies, body_names, skeleton.joint_names))
+    told = [f"joint between {body_names[a]} and {body_names[b]}" for a, b in skeleton.joint_bodies]
+    positions = [skeleton.joint_positions]
+    residuals = [np.full(skeleton.joint_positions.shape[:2], np.nan)]
     if keypoints is not None:
-        points = keypoint_markers(keypoints, float(skeleton["fps"]), up)
+        points = keypoint_markers(keypoints, skeleton.fps, up)
         labels += points.names
         told += points.descriptions or ()
         positions.append(points.positions)
         residuals.append(np.full(points.present.shape, np.nan) if points.residuals is None else points.residuals)
     if ellipsoids is not None:
-        bodies = [body_names[b] if 0 <= b < n_bodies else "no body" for b in ellipsoids["body"].astype(int)]
+        bodies = [body_names[b] if 0 <= b < count else "no body" for b in ellipsoids.bodies]
         labels += [f"ellipsoid{k:03d}" for k in range(len(bodies))]
         told += [f"centre of an ellipsoid of {b}" for b in bodies]
-        centers = np.asarray(ellipsoids["centers"], float)
-        if "counts" in ellipsoids:
-            centers = np.where(ellipsoids["counts"][..., None] > 0, centers, np.nan)
-        positions.append(centers)
-        residuals.append(np.full(centers.shape[:2], np.nan))
+        positions.append(ellipsoids.seen_centers)
+        residuals.append(np.full(ellipsoids.counts.shape, np.nan))
     if not labels:
-        labels, told = list(body_names), ["centre of a body"] * n_bodies
-        positions = [np.asarray(skeleton["body_positions"])]
+        labels, told = list(body_names), ["centre of a body"] * count
+        positions = [skeleton.body_positions]
         residuals = [np.full(positions[0].shape[:2], np.nan)]
     lengths = {len(p) for p in positions}
     if len(lengths) > 1:
@@ -122,39 +120,25 @@ def markers_from_run(
     return Markers(
         tuple(labels),
         np.concatenate(positions, axis=1).astype(float),
-        float(skeleton["fps"]),
+        skeleton.fps,
         up,
         np.concatenate(residuals, axis=1),
         descriptions=tuple(told),
     )
 
 
-def keypoint_markers(keypoints: Mapping[str, np.ndarray], fps: float, up: Axis = "z") -> Markers:
-    """Return the key-points of `keypoints.npz` as markers.
+def keypoint_markers(points: KeyPoints, fps: float, up: Axis = "z") -> Markers:
+    """Return key-points as markers.
 
     Their residuals are the standard deviations, but not known in bridged frames: C3D has 0 there, as it is customary
     for points that were not measured but filled in.
-
-    Parameters
-    ----------
-    keypoints : mapping
-        Arrays of `keypoints.npz`, of which only names, positions and radius must be there.
-    fps : float
-    up : "x", "y" or "z"
     """
-    positions = np.asarray(keypoints["positions"], float)
-    residuals = None
-    if "std" in keypoints and "bridged" in keypoints:
-        residuals = np.where(keypoints["bridged"], np.nan, np.maximum(keypoints["std"], LEAST_RESIDUAL))
+    paths = points.paths
     return Markers(
-        tuple(str(n) for n in keypoints["names"]),
-        positions,
+        points.names,
+        paths.positions.astype(float),
         fps,
         up,
-        residuals,
-        tuple(f"key-point, radius {r * 1000:.0f} mm" for r in keypoints["radius"]),
+        np.where(paths.bridged, np.nan, np.maximum(paths.std, LEAST_RESIDUAL)),
+        tuple(f"key-point, radius {r * 1000:.0f} mm" for r in points.radius),
     )
-
-
-def _texts(arrays: Mapping[str, np.ndarray], key: str) -> list[str] | None:
-    return [str(x) for x in arrays[key]] if key in arrays else None

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from geomocap.export.export_errors import MotionError
+from geomocap.model.skeleton import body_names
 
 
 @dataclass(frozen=True)
@@ -62,14 +63,14 @@ class Names:
         bodies = {**table.pop("bodies", {}), **table}
         return cls(_by_number(bodies, path, "body"), _by_number(joints, path, "joint"), str(path))
 
-    def body_names(self, n: int, found: Sequence[str] | None = None) -> tuple[str, ...]:
+    def body_names(self, n: int, found: Sequence[str] | np.ndarray | None = None) -> tuple[str, ...]:
         """Return the names of `n` bodies: the user's, or the found ones, or `body00` …"""
         self._check(self.bodies, n, "body", "bodies")
-        default = found if found is not None else [f"body{b:02d}" for b in range(n)]
+        default = found if found is not None else body_names(n)
         return _unique([self.bodies.get(b, str(default[b])) for b in range(n)], self.source)
 
     def joint_names(
-        self, joint_bodies: np.ndarray, body_names: Sequence[str], found: Sequence[str] | None = None
+        self, joint_bodies: np.ndarray, body_names: Sequence[str], found: Sequence[str] | np.ndarray | None = None
     ) -> tuple[str, ...]:
         """Return the names of joints: the user's, or those of the bodies that it joins where the user named any.
 

@@ -25,7 +25,9 @@ from geomocap.export.skinned_mesh import SkinnedMesh
 from geomocap.export.tables import motion_table, write_csv, write_parquet
 from geomocap.export.trc import write_trc
 from geomocap.export.usd import write_usd
+from geomocap.files.results import ELLIPSOIDS, KEYPOINTS, read_ellipsoids, read_keypoint_paths, read_skeleton
 from geomocap.files.run import Run
+from geomocap.model.skeleton import Skeleton
 from geomocap.progress import Progress, silent
 from geomocap.settings import check_settings
 from geomocap.subject.subject_model import MODEL_FILE, read_model
@@ -100,14 +102,11 @@ def export_run(
     unknown = sorted(set(formats or ()) - set(FILES))
     if unknown:
         raise MotionError(f"{unknown[0]}: no motion format; expected one of {', '.join(FILES)}")
-    skeleton = run.read_npz("skeleton.npz")
+    skeleton = read_skeleton(run)
     if names is None and (run.path / "names.toml").is_file():
         names = Names.read(run.path / "names.toml")
     up = run_up(run)
-    source = str(run.path / "skeleton.npz")
-    motion = motion_from_skeleton(
-        skeleton, up=up, names=names, joints=settings.joints, source=source, radius=mean_radius(run)
-    )
+    motion = motion_from_skeleton(skeleton, up=up, names=names, joints=settings.joints, radius=mean_radius(run))
     markers = run_markers(run, skeleton, names, up, ellipsoids=settings.ellipsoids)
     mesh = surface_of_run(run, motion, settings)
     writers = _writers(motion, markers, mesh, settings)
@@ -124,7 +123,7 @@ def export_run(
             skipped[name] = str(error)
         progress("export", k + 1, len(chosen))
     shifting = tuple(n for n, m, j in zip(motion.names, motion.moving, motion.joints, strict=True) if m and j >= 0)
-    return Exported(files, skipped, motion.largest_deviation_mm(skeleton["joint_positions"]), shifting)
+    return Exported(files, skipped, motion.largest_deviation_mm(skeleton.joint_positions), shifting)
 
 
 def run_settings(run: Run) -> ExportSettings:
@@ -148,16 +147,13 @@ def run_up(run: Run) -> Axis:
 
 def mean_radius(run: Run) -> float:
     """Return the mean semi-axis of a run's ellipsoids, metres."""
-    shells = run.read_npz("ellipsoids.npz") if (run.path / "ellipsoids.npz").is_file() else {}
-    return float(np.mean(shells["radii"])) if "radii" in shells else UNKNOWN_RADIUS
+    return float(np.mean(read_ellipsoids(run).radii)) if run.has(ELLIPSOIDS) else UNKNOWN_RADIUS
 
 
-def run_markers(
-    run: Run, skeleton: dict[str, np.ndarray], names: Names | None, up: Axis, *, ellipsoids: bool = True
-) -> Markers:
+def run_markers(run: Run, skeleton: Skeleton, names: Names | None, up: Axis, *, ellipsoids: bool = True) -> Markers:
     """Return a run's joints, key-points and ellipsoid centres as markers; the bodies' centres if it has none."""
-    keypoints = run.read_npz("keypoints.npz") if (run.path / "keypoints.npz").is_file() else None
-    shells = run.read_npz("ellipsoids.npz") if ellipsoids and (run.path / "ellipsoids.npz").is_file() else None
+    keypoints = read_keypoint_paths(run) if run.has(KEYPOINTS) else None
+    shells = read_ellipsoids(run) if ellipsoids and run.has(ELLIPSOIDS) else None
     return markers_from_run(skeleton, ellipsoids=shells, keypoints=keypoints, names=names, up=up)
 
 

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Literal
-
 import numpy as np
-import open3d as o3d
 from scipy import sparse
 from scipy.spatial import cKDTree
 
@@ -14,9 +10,8 @@ from geomocap.export.export_errors import MotionError
 from geomocap.export.export_settings import ExportSettings
 from geomocap.export.motion_tree import MotionTree
 from geomocap.export.skinned_mesh import INFLUENCES, SkinnedMesh
-from geomocap.files.open3d_geometry import read_by_open3d
+from geomocap.files.frame_files import read_points, read_voxels
 from geomocap.files.run import Run
-from geomocap.model.frame_geometry import Voxels
 from geomocap.model.surface import Surface, surface_through
 
 VOTERS = 15  # points that say which body a vertex belongs to
@@ -42,7 +37,10 @@ def skin_from_run(run: Run, motion: MotionTree, settings: ExportSettings) -> Ski
     file = run.frame_file("bodies", frame)
     if frame >= motion.n_frames or not file.is_file():
         raise MotionError(f"{file}: missing; the skin needs a frame that was segmented (export.skin_frame)")
-    points, labels, colors, normals = _read_bodies(file)
+    read = read_points(file)
+    points, labels, colors, normals = read.positions, read.body, read.shown_colors, read.normals
+    if not (labels >= 0).any():
+        raise MotionError(f"{file}: no point belongs to a body; choose another reference frame (export.skin_frame)")
     if settings.skin_colors == "true":
         colors = _true_colors(run, frame, points)
     surface = surface_through(points, normals, settings.skin_triangles)
@@ -136,33 +134,15 @@ def node_of_body(motion: MotionTree, bodies: np.ndarray) -> np.ndarray:
     return nodes
 
 
-def _read_bodies(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-    cloud = read_by_open3d(o3d.t.io.read_point_cloud, file)
-    if "positions" not in cloud.point or "body" not in cloud.point:
-        raise MotionError(f"{file}: no points with the attribute body; delete it and run again")
-    points = cloud.point.positions.numpy().astype(float)
-    labels = cloud.point["body"].numpy().ravel().astype(int)
-    if not (labels >= 0).any():
-        raise MotionError(f"{file}: no point belongs to a body; choose another reference frame (export.skin_frame)")
-    colors = _bytes(cloud.point.colors.numpy()) if "colors" in cloud.point else np.full((len(points), 3), 200, np.uint8)
-    normals = cloud.point.normals.numpy().astype(float) if "normals" in cloud.point else None
-    return points, labels, colors, normals
-
-
 def _true_colors(run: Run, frame: int, points: np.ndarray) -> np.ndarray:
     """Colours of the nearest voxels, or cloud points, of the frame: (N, 3) uint8."""
-    kind: Literal["voxels", "cloud"] = "voxels" if run.frame_file("voxels", frame).is_file() else "cloud"
-    file = run.frame_file(kind, frame)
-    if kind == "voxels":
-        voxels = Voxels.read(file)
+    if (file := run.frame_file("voxels", frame)).is_file():
+        voxels = read_voxels(file)
         places, colors = voxels.points, voxels.colors
     else:
-        cloud = read_by_open3d(o3d.t.io.read_point_cloud, file) if file.is_file() else o3d.t.geometry.PointCloud()
-        if "positions" not in cloud.point or "colors" not in cloud.point:
+        file = run.frame_file("cloud", frame)
+        cloud = read_points(file) if file.is_file() else None
+        if cloud is None or cloud.colors is None:
             raise MotionError(f'{file}: no colours there; keep skin_colors = "body"')
-        places, colors = cloud.point.positions.numpy(), _bytes(cloud.point.colors.numpy())
+        places, colors = cloud.positions, cloud.colors
     return colors[cKDTree(places).query(points)[1]]
-
-
-def _bytes(colors: np.ndarray) -> np.ndarray:
-    return colors if colors.dtype == np.uint8 else np.clip(np.rint(colors * 255), 0, 255).astype(np.uint8)

@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 
 from geomocap.export.export_errors import MotionError, require
-from geomocap.export.file_rotations import zxy_angles
 from geomocap.export.markers import Markers
 from geomocap.export.motion_tree import MotionTree
 from geomocap.files.atomic import write_atomic, write_text
+from geomocap.model.rotations import turn_angles, zxy_angles
 
 
 def motion_table(markers: Markers, motion: MotionTree) -> dict[str, np.ndarray]:
@@ -49,14 +49,13 @@ def motion_table(markers: Markers, motion: MotionTree) -> dict[str, np.ndarray]:
     for k, name in enumerate(markers.names):
         for axis, letter in enumerate("xyz"):
             columns[f"{name}_{letter}_m"] = markers.positions[:, k, axis]
-    angles = np.rad2deg(zxy_angles(motion.rotations))
-    cosine = (np.trace(motion.rotations, axis1=-2, axis2=-1) - 1) / 2
-    turn = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
+    euler = np.rad2deg(zxy_angles(motion.rotations))
+    turn = np.rad2deg(turn_angles(motion.rotations))
     for n, name in enumerate(motion.names):
         if motion.bodies[n] < 0:
             continue
         for i, letter in enumerate("zxy"):
-            columns[f"{name}_{letter}_deg"] = angles[:, n, i]
+            columns[f"{name}_{letter}_deg"] = euler[:, n, i]
         columns[f"{name}_turn_deg"] = turn[:, n]
     return columns
 

@@ -12,11 +12,11 @@ import numpy as np
 
 from geomocap.export.conventions import USD
 from geomocap.export.export_errors import require
-from geomocap.export.file_rotations import quaternions
 from geomocap.export.glb import linear_light
 from geomocap.export.motion_tree import MotionTree
 from geomocap.export.skinned_mesh import INFLUENCES, SkinnedMesh, bone_mesh
 from geomocap.files.atomic import write_atomic
+from geomocap.model.rotations import quaternions
 
 ROOT, SKELETON, ANIMATION, SURFACE = "/subject", "/subject/skeleton", "/subject/skeleton/motion", "/subject/surface"
 

@@ -25,6 +25,7 @@ from pydantic import Field, ValidationError, field_validator
 from geomocap.errors import CaptureError
 from geomocap.files.atomic import fingerprint, links, write_text
 from geomocap.files.images import IMAGE_ENDINGS, ImageFolder, read_image, size_text
+from geomocap.files.rigs import read_rig
 from geomocap.files.videos import VIDEO_ENDINGS, Video
 from geomocap.model.rig import Rig
 from geomocap.settings import Settings
@@ -259,7 +260,7 @@ class Capture:
         """
         if not self.is_calibrated:
             raise CaptureError(f"{self.path}: not calibrated, no folder sparse/; run `geomocap calibrate {self.path}`")
-        rig = Rig.read(self.path / "sparse", self.cameras)
+        rig = read_rig(self.path / "sparse", self.cameras)
         for name, (w, h) in zip(rig.names, rig.sizes, strict=True):
             size = self.sources[name].size
             if size != (w, h):
@@ -273,6 +274,22 @@ class Capture:
     def fingerprint(self, *parts: str) -> str:
         """Digest of the names, sizes and times of the files of these parts ("images", "masks", "sparse" …)."""
         return fingerprint([self.path / "capture.toml", *(self.path / p for p in parts)])
+
+
+def open_capture(path: str | Path) -> Capture:
+    """Open a capture: cameras, calibration and frames, read when they are asked for.
+
+    Parameters
+    ----------
+    path : str or Path
+        Its folder.
+
+    Raises
+    ------
+    CaptureError
+        If the folder is no capture, or its parts don't fit together.
+    """
+    return Capture.open(Path(path))
 
 
 def check_links(path: Path) -> None:

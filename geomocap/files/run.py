@@ -1,6 +1,6 @@
 """A run: the output folder, written whole file by whole file, that knows which of its stages are up to date.
 
-Every stage has a key, the digest of all its inputs, its settings and the code's version. The keys are kept in
+Every stage has a key, the digest of all its inputs, its settings and the code that it uses. The keys are kept in
 `RUN/.stages/`. A stage whose key has changed is cleared before it writes; one whose key is the same goes on from the
 files that are there.
 """
@@ -16,30 +16,31 @@ import tomllib
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tomli_w
 
-import geomocap
 from geomocap.errors import RunError
-from geomocap.files.atomic import write_atomic, write_text
+from geomocap.files.atomic import write_text
+from geomocap.files.npz import read_npz, write_npz
+from geomocap.source_digest import module_digest
+from geomocap.version import __version__
 
 
-@cache
-def code_version() -> str:
-    """The package's version with a digest of its sources, so that changed code never reuses old results."""
-    digest = hashlib.blake2b(digest_size=8)
-    for file in sorted(Path(geomocap.__file__).parent.rglob("*.py")):
-        digest.update(file.read_bytes())
-    return f"{geomocap.__version__}+{digest.hexdigest()}"
+def stage_key(module: str, *parts: Any) -> str:
+    """Digest of all that a stage's results depend on: its code, its inputs and its settings.
 
-
-def stage_key(*parts: Any) -> str:
-    """Digest of whatever a stage depends on (strings, numbers, settings dumped to dicts) and the code's version."""
-    text = json.dumps([code_version(), *parts], sort_keys=True, default=str)
+    Parameters
+    ----------
+    module : str
+        The stage's module, `__name__` there: what this module and those that it imports do is part of the key, comments
+        and docstrings are not.
+    *parts
+        Strings, numbers, settings dumped to dicts.
+    """
+    text = json.dumps([__version__, module_digest(module), *parts], sort_keys=True, default=str)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
@@ -77,34 +78,17 @@ class Run:
         """Frame numbers of a kind of geometry that are there."""
         return sorted(int(p.stem) for p in (self.path / kind).glob("[0-9]*.ply"))
 
+    def has(self, name: str) -> bool:
+        """Whether a file is there."""
+        return (self.path / name).is_file()
+
     def write_npz(self, name: str, **arrays: Any) -> None:
         """Write an NPZ file of plain arrays, whole or not at all."""
-        for key, value in arrays.items():
-            if np.asarray(value).dtype == object:
-                raise RunError(f"{name}: {key} is no plain array")
-
-        def write(path: Path) -> None:
-            with path.open("wb") as file:
-                np.savez_compressed(file, **arrays)
-
-        write_atomic(self.path / name, write)
+        write_npz(self.path / name, arrays)
 
     def read_npz(self, name: str, only: Collection[str] = ()) -> dict[str, np.ndarray]:
-        """Read an NPZ file of the run, never executing anything in it; of its arrays those named in `only`, if any are.
-
-        Raises
-        ------
-        RunError
-            If the file is missing or damaged.
-        """
-        file = self.path / name
-        try:
-            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
-                return {key: data[key] for key in data.files if not only or key in only}
-        except FileNotFoundError:
-            raise RunError(f"{file}: missing; run the stage that writes it") from None
-        except Exception as error:
-            raise RunError(f"{file}: damaged ({error}); delete it and run again") from None
+        """Read an NPZ file of the run; of its arrays those named in `only`, if any are."""
+        return read_npz(self.path / name, only)
 
     # --- stages ---
 
@@ -144,6 +128,10 @@ class Run:
         if state.get("key") != key or not state.get("done"):
             return False
         return all((self.path / name).exists() for name in state["outputs"])
+
+    def unfinished(self) -> list[str]:
+        """Stages that were begun and aren't complete."""
+        return [f.stem for f in sorted((self.path / ".stages").glob("*.json")) if not self._state(f.stem).get("done")]
 
     def _state(self, stage: str) -> dict[str, Any]:
         try:

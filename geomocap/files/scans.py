@@ -12,10 +12,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-from pydantic import Field
 from scipy.spatial import cKDTree
 
 from geomocap.errors import GeometryError
@@ -30,21 +28,9 @@ from geomocap.files.scan_geometry import (
     read_array,
     read_surface,
 )
-from geomocap.settings import Settings
+from geomocap.files.scan_settings import ScanSettings
 
 _FARTHEST = 1e5  # diagonals from the origin; ten times farther the equations of motion lose their last digits
-
-
-class ScanSettings(Settings):
-    """How scans become point sets."""
-
-    samples: int = Field(20000, ge=16, description="points sampled on each mesh's surface (points)")
-    spacing: float | None = Field(
-        None, gt=0, description="distance of neighbouring points (scan units); measured on the first scan if not given"
-    )
-    scale: float = Field(1.0, gt=0, description="metres per unit of the scans, 0.001 for millimetres")
-    up: Literal["x", "y", "z"] = Field("z", description="axis of the scans that points up; y in glTF files")
-    seed: int = Field(0, ge=0, description="seed of the surface sampling")
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from geomocap.errors import GeomocapError
+from geomocap.files.rigs import read_rig
 from geomocap.inspection.description import Description, count
 from geomocap.model.rig import Rig
 
@@ -19,7 +20,7 @@ def describe_calibration(path: Path) -> Description:
     """Describe a calibration folder (a COLMAP model)."""
     told = Description(path, "calibration")
     try:
-        describe_rig(Rig.read(path), told)
+        describe_rig(read_rig(path), told)
     except GeomocapError as error:
         told.problem(error)
     return told

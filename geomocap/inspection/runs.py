@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,16 @@ import numpy as np
 from geomocap.errors import GeomocapError
 from geomocap.export.run_export import FILES
 from geomocap.export.skeleton_motion import motion_from_skeleton
+from geomocap.files.results import (
+    ELLIPSOIDS,
+    KEYPOINTS,
+    SKELETON,
+    TRACKS,
+    read_ellipsoids,
+    read_keypoint_paths,
+    read_skeleton,
+    read_trajectories,
+)
 from geomocap.files.run import Run
 from geomocap.inspection.description import Description, count, shortened
 
@@ -40,66 +49,56 @@ def describe_run(path: Path) -> Description:
                 told.problem(
                     f"{kind}/ lacks {count(len(missing), 'frame')} from {missing[0]:06d} on; start the run again"
                 )
-    for name, tell in (
-        ("ellipsoids.npz", _ellipsoids),
-        ("skeleton.npz", _skeleton),
-        ("tracks.npz", _tracks),
-        ("keypoints.npz", _keypoints),
-    ):
-        if (path / name).is_file():
+    for name, tell in ((ELLIPSOIDS, _ellipsoids), (SKELETON, _skeleton), (TRACKS, _tracks), (KEYPOINTS, _keypoints)):
+        if run.has(name):
             try:
-                tell(run.read_npz(name), told)
-            except (GeomocapError, KeyError, ValueError, IndexError) as error:
-                told.problem(f"{name}: {'lacks ' if isinstance(error, KeyError) else ''}{error}")
+                tell(run, told)
+            except GeomocapError as error:
+                told.problem(error)
     files = [f for f in FILES.values() if (path / f).is_file()]
     told.fact("motion files", shortened(files) if files else "none")
     _stages(run, told)
     return told
 
 
-def _ellipsoids(arrays: dict[str, np.ndarray], told: Description) -> None:
-    frames, number = arrays["centers"].shape[:2]
-    bodies = count(len(np.unique(arrays["body"])), "body", "bodies")
-    told.fact(
-        "ellipsoids",
-        f"{number} in {count(frames, 'frame')}, of {bodies}",
-    )
+def _ellipsoids(run: Run, told: Description) -> None:
+    found = read_ellipsoids(run)
+    bodies = count(len(np.unique(found.bodies)), "body", "bodies")
+    told.fact("ellipsoids", f"{len(found)} in {count(found.frame_count, 'frame')}, of {bodies}")
 
 
-def _skeleton(arrays: dict[str, np.ndarray], told: Description) -> None:
-    motion = motion_from_skeleton(arrays)
-    joints = arrays["joint_positions"]
-    bodies = arrays["body_rotations"].shape[1]
-    told.fact("skeleton", f"{count(joints.shape[1], 'joint')} between {count(bodies, 'body', 'bodies')}")
+def _skeleton(run: Run, told: Description) -> None:
+    skeleton = read_skeleton(run)
+    motion = motion_from_skeleton(skeleton)
+    joints, rotations = skeleton.joint_positions, skeleton.body_rotations
+    bodies = count(skeleton.body_count, "body", "bodies")
+    told.fact("skeleton", f"{count(skeleton.joint_count, 'joint')} between {bodies}")
     told.fact("motion", f"{motion.n_frames} frames at {motion.fps:g} per second, {motion.n_frames / motion.fps:.2f} s")
     shifting = int((motion.moving & (motion.joints >= 0)).sum())
     if shifting:
         told.fact("joints not fixed in their bodies", f"{shifting}; files shift them in every frame")
-    if len(motion.parents) > 1 and motion.names[0] == "origin":
-        told.problem(f"the skeleton falls into {(motion.parents == 0).sum()} separate parts")
     gaps = 1 - np.isfinite(joints).all(axis=-1).mean() if joints.size else 0.0
     if gaps:
         told.problem(f"joints lack a position in {100 * gaps:.1f} % of the frames; files fill them in")
-    if not np.isfinite(arrays["body_rotations"]).all():
+    if not np.isfinite(rotations).all():
         told.problem("body rotations hold NaN; files turn evenly across them")
-    elif np.abs(arrays["body_rotations"][0] - np.eye(3)).max() > 1e-3:
+    elif np.abs(rotations[0] - np.eye(3)).max() > 1e-3:
         told.problem("body rotations don't begin at the identity: they aren't rotations since the first frame")
 
 
-def _tracks(arrays: dict[str, np.ndarray], told: Description) -> None:
-    tracked = np.isfinite(arrays["positions"]).all(axis=-1)
-    length = tracked.sum(axis=1)
-    told.fact(
-        "tracks", f"{len(tracked)} points in {tracked.shape[1]} frames, on average {length.mean():.1f} frames long"
-    )
+def _tracks(run: Run, told: Description) -> None:
+    found = read_trajectories(run)
+    length = found.lengths
+    told.fact("tracks", f"{len(found)} points in {found.n_frames} frames, on average {length.mean():.1f} frames long")
     if (length == 0).any():
         told.problem(f"{(length == 0).sum()} tracks have no position in any frame")
 
 
-def _keypoints(arrays: dict[str, np.ndarray], told: Description) -> None:
-    told.fact("key-points", shortened([str(n) for n in arrays["names"]]))
-    present = np.isfinite(arrays["positions"]).all(axis=-1)
-    for k, name in enumerate(arrays["names"]):
+def _keypoints(run: Run, told: Description) -> None:
+    points = read_keypoint_paths(run)
+    told.fact("key-points", shortened(list(points.names)))
+    present = np.isfinite(points.paths.positions).all(axis=-1)
+    for k, name in enumerate(points.names):
         if not present[:, k].all():
             told.problem(f"key-point {name} has no position in {(~present[:, k]).sum()} of {len(present)} frames")
 
@@ -107,12 +106,7 @@ def _keypoints(arrays: dict[str, np.ndarray], told: Description) -> None:
 def _stages(run: Run, told: Description) -> None:
     for name, timing in run.read_timings().items():
         told.fact(f"time of {name}", f"{timing['seconds']:.1f} s, {timing['items_per_second']:.2f} items/s")
-    for file in sorted((run.path / ".stages").glob("*.json")):
-        try:
-            done = json.loads(file.read_text())["done"]
-        except (OSError, ValueError, KeyError):
-            done = False
-        if not done:
-            told.problem(f"stage {file.stem} isn't finished; start the run again and it goes on")
+    for name in run.unfinished():
+        told.problem(f"stage {name} isn't finished; start the run again and it goes on")
     for left in run.path.rglob(".*.tmp.*"):
         told.problem(f"{left.relative_to(run.path)} was left by a killed run; it may be deleted")

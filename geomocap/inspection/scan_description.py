@@ -8,8 +8,9 @@ import numpy as np
 
 from geomocap.errors import GeomocapError
 from geomocap.files.scan_geometry import ScanSurface
+from geomocap.files.scan_settings import ScanSettings
 from geomocap.files.scan_tracks import scan_tracks
-from geomocap.files.scans import Scans, ScanSettings, open_scans
+from geomocap.files.scans import Scans, open_scans
 from geomocap.inspection.capture_description import MOST_NAMED
 from geomocap.inspection.description import Description, count
 
@@ -37,7 +38,7 @@ def describe_scans(path: Path) -> Description:
         told.fact("missing points", f"{missing:.1%} (NaN)")
     low = np.min([np.nanmin(s.points, axis=0) for s in surfaces], axis=0)
     high = np.max([np.nanmax(s.points, axis=0) for s in surfaces], axis=0)
-    told.fact("box around all", " × ".join(f"{side:.4g}" for side in high - low) + ", taken for metres (--scans.scale)")
+    told.fact("box around all", " × ".join(f"{side:.4g}" for side in high - low) + ", taken for metres (--scale)")
     if len(scans) == 1:
         told.fact("motion", "none: one scan gets its ellipsoids")
     elif not told.problems:

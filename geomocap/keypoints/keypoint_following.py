@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomocap.errors import GeometryError
+from geomocap.model.keypoint_paths import KeyPointPaths
 from geomocap.model.rotations import rigid_motion
 from geomocap.model.trajectories import Trajectories
 
@@ -22,34 +23,12 @@ REACH = 4.0
 """Radii within which trajectories bridge gaps."""
 
 _LEAST = 3  # trajectories inside that a frame needs not to be bridged; those that a turn needs
-_NOISE = 0.001  # m; what a trajectory drifts between frames that its stated precision doesn't know
+_NOISE = 5e-4  # diagonals; what a trajectory drifts between frames that its stated precision doesn't know
 _SOFT = 0.15  # standard deviation of skin against a rigid body, fraction of the distance; steeper beyond the radius
 _MEMORY = 12.0  # weight of the largest misfit before in a trajectory's variance
-_ALIKE = 0.003  # m; largest shift within one frame, in the key-point's axes, of a trajectory that joins in
+_ALIKE = 1.5e-3  # diagonals; largest shift within one frame, in the key-point's axes, of a trajectory that joins in
 _LOST = 0.5  # radii; standard deviation from which a key-point counts as lost
-_STEADY = 0.001  # m; how far points may be apart to determine a turn, against the last one
-
-
-@dataclass(frozen=True)
-class KeyPointPaths:
-    """Key-points through time.
-
-    Attributes
-    ----------
-    positions : (T, K, 3) float, metres, world
-        NaN where nothing near was measured.
-    bridged : (T, K) bool
-        Carried by the body round the point instead of the trajectories inside.
-    n_tracks : (T, K) int
-        Trajectories that it was moved by: those inside, where it is bridged those around.
-    std : (T, K) float, metres
-        Standard deviation of the place against that in the frame where it was put.
-    """
-
-    positions: np.ndarray
-    bridged: np.ndarray
-    n_tracks: np.ndarray
-    std: np.ndarray
+_STEADY = 5e-4  # diagonals; how far points may be apart to determine a turn, against the last one
 
 
 @dataclass(frozen=True)
@@ -60,16 +39,22 @@ class Measured:
     ----------
     places : (T, N, 3) float, metres, world
     variance : (T, N) float, metres²
+    diagonal : float, metres
+        Of the box around a frame's trajectories: the median of all frames.
     """
 
     places: np.ndarray
     variance: np.ndarray
+    diagonal: float
 
     @classmethod
     def of(cls, tracks: Trajectories) -> Measured:
         """Arrange trajectories by frame; unknown precision counts as good."""
         places = np.ascontiguousarray(tracks.positions.transpose(1, 0, 2))
-        return cls(places, np.nan_to_num(np.ascontiguousarray(tracks.sigma.T) ** 2, nan=0.0) + _NOISE**2)
+        seen = [x[known] for x in places if (known := np.isfinite(x[:, 0])).any()]
+        diagonal = float(np.median([np.linalg.norm(np.ptp(x, axis=0)) for x in seen])) if seen else 0.0
+        known_variance = np.nan_to_num(np.ascontiguousarray(tracks.sigma.T) ** 2, nan=0.0)
+        return cls(places, known_variance + (_NOISE * diagonal) ** 2, diagonal)
 
 
 def follow_keypoints(
@@ -141,7 +126,7 @@ def _follow(measured: Measured, center: np.ndarray, radius: float, order: range,
             distance = np.linalg.norm(a, axis=1)
             soft = (_SOFT * distance) ** 2 * (1 + (distance / radius) ** 2)
             variance = measured.variance[t, known] + joined[known] + _MEMORY * misfit[known] + soft
-            moved, miss = _fit(a, x[known], variance, pose.turn)
+            moved, miss = _fit(a, x[known], variance, pose.turn, _STEADY * measured.diagonal)
             if moved.variance > (_LOST * radius) ** 2:
                 continue
             pose = moved
@@ -159,21 +144,21 @@ def _follow(measured: Measured, center: np.ndarray, radius: float, order: range,
             paths.n_tracks[t, k] = len(new) if inside < _LEAST else inside
         else:  # who moves alike joins in
             shift = np.linalg.norm(pose.local(x[new]) - last[1].local(measured.places[last[0], new]), axis=1)
-            new = new[shift < _ALIKE]
+            new = new[shift < _ALIKE * measured.diagonal]
         local[new] = pose.local(x[new])
         joined[new] = pose.variance
         last = t, pose
 
 
 def _fit(
-    local: np.ndarray, world: np.ndarray, variance: np.ndarray, last_turn: np.ndarray
+    local: np.ndarray, world: np.ndarray, variance: np.ndarray, last_turn: np.ndarray, steady: float
 ) -> tuple[_Placement, np.ndarray]:
     """Fit world = R local + t robustly, and return it with the misfits (N,). With fewer than three points R stays."""
     weight, turn = 1 / variance, last_turn
     for _ in range(6):
         if len(local) >= _LEAST:
             # the last turn steadies directions that the points hardly determine
-            turn, place = rigid_motion(local, world, weight, prior=_STEADY**2 * last_turn)
+            turn, place = rigid_motion(local, world, weight, prior=steady**2 * last_turn)
         else:
             place = weight @ (world - local @ turn.T) / weight.sum()
         miss = np.linalg.norm(world - local @ turn.T - place, axis=1)

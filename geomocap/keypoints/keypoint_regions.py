@@ -10,10 +10,13 @@ import numpy as np
 import tomli_w
 from pydantic import AfterValidator, Field, model_validator
 
-from geomocap.errors import SettingsError
+from geomocap.errors import GeometryError, SettingsError
 from geomocap.files.atomic import write_text
-from geomocap.keypoints.keypoint_following import KeyPointPaths, Measured, follow_keypoints
+from geomocap.keypoints.keypoint_following import REACH, Measured, follow_keypoints
+from geomocap.model.keypoint_paths import KeyPointPaths, KeyPoints
+from geomocap.model.trajectories import Trajectories
 from geomocap.settings import Settings, check_settings
+from geomocap.trajectories.smoothing import smooth_motion
 
 _DECIMALS = 6  # of centres and radii in files: micrometres
 
@@ -128,3 +131,45 @@ def follow_regions(measured: Measured, points: tuple[KeyPoint, ...]) -> KeyPoint
         paths.positions[:, here], paths.bridged[:, here] = found.positions, found.bridged
         paths.n_tracks[:, here], paths.std[:, here] = found.n_tracks, found.std
     return paths
+
+
+def follow_placed(tracks: Trajectories, file: KeyPointFile, fps: float) -> KeyPoints:
+    """Follow key-points through trajectories, with velocities.
+
+    Parameters
+    ----------
+    tracks : Trajectories
+    file : KeyPointFile
+    fps : float
+        Frames per second.
+
+    Raises
+    ------
+    GeometryError
+        If there are no key-points, or one is placed in a frame that isn't there or where no trajectories are.
+    """
+    if not file.keypoint:
+        raise GeometryError("no key-points are given; add [[keypoint]] tables, or place them with --edit")
+    last = tracks.n_frames - 1
+    for p in file.keypoint:
+        if p.frame > last:
+            raise GeometryError(f"key-point {p.name}: placed in frame {p.frame}, but there are frames 0 to {last}")
+    paths = follow_regions(Measured.of(tracks), file.keypoint)
+    for k, p in enumerate(file.keypoint):
+        if paths.n_tracks[p.frame, k] == 0:
+            raise GeometryError(
+                f"key-point {p.name}: no trajectory within {1000 * REACH * p.radius:.0f} mm ({REACH:g} radii) of its "
+                f"centre in frame {p.frame}; move it onto the surface, enlarge it, or place it in a frame where "
+                "trajectories run there"
+            )
+    motion = smooth_motion(paths.positions.transpose(1, 0, 2), fps)
+    names = file.names
+    return KeyPoints(
+        tuple(names),
+        np.array([p.radius for p in file.keypoint]),
+        paths,
+        np.array([[names.index(n) for n in link] for link in file.links], int).reshape(-1, 2),
+        motion.velocities.transpose(1, 0, 2),
+        motion.accelerations.transpose(1, 0, 2),
+        fps,
+    )

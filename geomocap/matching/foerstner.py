@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from geomocap.matching.matching_settings import SeedSettings
+
 
 @dataclass(frozen=True)
 class InterestPoints:
@@ -30,7 +32,7 @@ class InterestPoints:
     roundness: np.ndarray
 
 
-def foerstner(image: np.ndarray, window: int = 7) -> tuple[np.ndarray, np.ndarray]:
+def foerstner(image: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
     """Return w and q of a grey image (H, W): two (H, W) float arrays; `window` is an odd edge length, pixels."""
     g = np.asarray(image, dtype=np.float64)
     gx = np.zeros_like(g)
@@ -48,13 +50,7 @@ def foerstner(image: np.ndarray, window: int = 7) -> tuple[np.ndarray, np.ndarra
 
 
 def interest_points(
-    image: np.ndarray,
-    mask: np.ndarray | None = None,
-    window: int = 7,
-    minimum_weight: float = 0.5,
-    minimum_roundness: float = 0.5,
-    cell: int = 14,
-    limit: int = 600,
+    image: np.ndarray, mask: np.ndarray | None = None, settings: SeedSettings | None = None
 ) -> InterestPoints:
     """Find the best point of every cell of the image.
 
@@ -63,24 +59,19 @@ def interest_points(
     image : (H, W) array, grey levels
     mask : (H, W) array, optional
         Non-zero where points may lie.
-    window : int
-        Edge of the operator's window, odd, pixels.
-    minimum_weight : float
-        Least w, as a multiple of its mean over the mask.
-    minimum_roundness : float
-        Least q.
-    cell : int
-        Edge of the cells that have at most one point each, pixels; points keep half of it between them.
-    limit : int
-        Most points.
+    settings : SeedSettings, optional
+        Window, least w (as a multiple of its mean over the mask) and q, cell and limit; points keep half a cell between
+        them.
     """
+    settings = settings or SeedSettings()
+    window, cell = settings.window | 1, settings.cell
     w, q = foerstner(image, window)
     usable = np.ones(w.shape, bool) if mask is None else np.asarray(mask) != 0
     border = window // 2 + 1
     usable[:border] = usable[-border:] = usable[:, :border] = usable[:, -border:] = False
     if not usable.any():
         return InterestPoints(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
-    good = usable & (q >= minimum_roundness) & (w >= minimum_weight * w[usable].mean()) & (w > 0)
+    good = usable & (q >= settings.minimum_roundness) & (w >= settings.minimum_weight * w[usable].mean()) & (w > 0)
     value = np.where(good, w, 0.0)
     reach = cell // 2 * 2 + 1
     peak = good & (value >= cv2.dilate(value, np.ones((reach, reach), np.uint8)))
@@ -88,6 +79,6 @@ def interest_points(
     order = np.lexsort([columns, rows, -w[rows, columns]])
     rows, columns = rows[order], columns[order]
     _, first = np.unique(rows // cell * (w.shape[1] // cell + 1) + columns // cell, return_index=True)
-    first = np.sort(first)[:limit]
+    first = np.sort(first)[: settings.limit]
     rows, columns = rows[first], columns[first]
     return InterestPoints(np.column_stack([columns, rows]) + 0.5, w[rows, columns], q[rows, columns])

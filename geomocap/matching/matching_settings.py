@@ -52,6 +52,7 @@ class GrowingSettings(Settings):
         gt=0.25,
         description="distance of neighbouring points in the template image; if not given 1.5, 2 with several "
         "templates, less in small images (px)",
+        json_schema_extra={"flag": "cloud-step"},
     )
     order: Literal["best", "paper"] = Field(
         "best", description="best: best neighbour first; paper: sequential horizontal and vertical shifts"
@@ -79,3 +80,14 @@ class GrowingSettings(Settings):
         le=1,
         description="fraction of a patch seen by several search images that makes it more than a pair's",
     )
+
+
+class WallisSettings(Settings):
+    """Target values of the Wallis filter."""
+
+    enabled: bool = Field(True, description="whether images are filtered at all")
+    window: int = Field(41, ge=3, description="edge of the window, odd (px)")
+    mean: float = Field(127.0, ge=0, le=255, description="target mean (grey levels)")
+    deviation: float = Field(50.0, gt=0, description="target standard deviation (grey levels)")
+    brightness: float = Field(1.0, ge=0, le=1, description="b: 1 forces the mean to the target, 0 keeps it")
+    contrast: float = Field(0.8, gt=0, le=1, description="c: 1 forces the deviation to the target")

@@ -94,15 +94,7 @@ def find_seeds(
         The strongest interest points first.
     """
     settings = settings or SeedSettings()
-    points = interest_points(
-        image,
-        mask,
-        settings.window | 1,
-        settings.minimum_weight,
-        settings.minimum_roundness,
-        settings.cell,
-        settings.limit,
-    )
+    points = interest_points(image, mask, settings)
     rows, columns = (points.pixels[:, ::-1].T - 0.5).astype(int)
     bounds = np.column_stack([1 / depth.far[rows, columns], 1 / depth.near[rows, columns]]).astype(np.float64)
     result = np.zeros((len(points.pixels), 5))

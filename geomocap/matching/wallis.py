@@ -10,20 +10,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from pydantic import Field
 
-from geomocap.settings import Settings
-
-
-class WallisSettings(Settings):
-    """Target values of the Wallis filter."""
-
-    enabled: bool = Field(True, description="whether images are filtered at all")
-    window: int = Field(41, ge=3, description="edge of the window, odd (px)")
-    mean: float = Field(127.0, ge=0, le=255, description="target mean (grey levels)")
-    deviation: float = Field(50.0, gt=0, description="target standard deviation (grey levels)")
-    brightness: float = Field(1.0, ge=0, le=1, description="b: 1 forces the mean to the target, 0 keeps it")
-    contrast: float = Field(0.8, gt=0, le=1, description="c: 1 forces the deviation to the target")
+from geomocap.matching.matching_settings import WallisSettings
 
 
 def local_statistics(image: np.ndarray, window: int, mask: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ the sums well conditioned and makes every threshold independent of the subject's
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -18,6 +18,7 @@ SHELL = 3.0
 
 FLAT = 1.0 / 12.0
 """Least variance along an axis, spacing²: points on one layer of a grid are as thick as a cell, not flat."""
+_MEASURED = ("centers", "radii", "rotations", "counts", "errors")
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,9 @@ class Ellipsoids:
     counts : (K,) int32
         Points that each was fitted to.
     errors : (K,) float, metres
-        Fitting error as an equivalent length, see `fitting_errors`.
+        Fitting error as an equivalent length, see `fit_ellipsoids`.
+    body : (K,) int, optional
+        Body of each ellipsoid, -1: none.
     """
 
     centers: np.ndarray
@@ -42,29 +45,53 @@ class Ellipsoids:
     rotations: np.ndarray
     counts: np.ndarray
     errors: np.ndarray
+    body: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         lead = self.counts.shape
         shapes = (self.centers.shape, self.radii.shape, self.rotations.shape, self.errors.shape)
         if shapes != ((*lead, 3), (*lead, 3), (*lead, 3, 3), lead):
             raise GeometryError(f"ellipsoids: arrays of shapes {shapes} don't belong together (counts {lead})")
+        if self.body is not None and self.body.shape != lead[-1:]:
+            raise GeometryError(f"ellipsoids: bodies of shape {self.body.shape}, expected {lead[-1:]}")
 
     def __len__(self) -> int:
         return self.counts.shape[-1]
 
+    @property
+    def frame_count(self) -> int:
+        """Number of frames T of a sequence."""
+        return len(self.counts)
+
+    @property
+    def bodies(self) -> np.ndarray:
+        """Body of each ellipsoid, (K,) int; -1: none."""
+        return np.full(len(self), -1) if self.body is None else self.body
+
+    @property
+    def body_count(self) -> int:
+        """Number of bodies that they belong to."""
+        return int(self.bodies.max(initial=-1)) + 1
+
+    @property
+    def seen_centers(self) -> np.ndarray:
+        """Centres (…, K, 3), metres, world; NaN where no points belong to an ellipsoid."""
+        return np.where(self.counts[..., None] > 0, self.centers, np.nan)
+
     @classmethod
-    def stack(cls, frames: list[Ellipsoids]) -> Ellipsoids:
+    def stack(cls, frames: list[Ellipsoids], body: np.ndarray | None = None) -> Ellipsoids:
         """Join the ellipsoids of T frames, all of the same number K, into arrays (T, K, …)."""
-        return cls(*(np.stack([getattr(f, name.name) for f in frames]) for name in fields(cls)))
+        return cls(**{name: np.stack([getattr(f, name) for f in frames]) for name in _MEASURED}, body=body)
 
     @classmethod
     def joined(cls, parts: list[Ellipsoids]) -> Ellipsoids:
-        """Put the ellipsoids of several parts beside each other, (T, ΣK, …)."""
-        return cls(*(np.concatenate([getattr(p, name.name) for p in parts], axis=1) for name in fields(cls)))
+        """Put the ellipsoids of several parts beside each other, (T, ΣK, …), without their bodies."""
+        return cls(**{name: np.concatenate([getattr(p, name) for p in parts], axis=1) for name in _MEASURED})
 
     def select(self, chosen: np.ndarray) -> Ellipsoids:
         """Some ellipsoids of a sequence, (T, K', …)."""
-        return Ellipsoids(*(getattr(self, name.name)[:, chosen] for name in fields(self)))
+        body = None if self.body is None else self.body[chosen]
+        return Ellipsoids(**{name: getattr(self, name)[:, chosen] for name in _MEASURED}, body=body)
 
 
 def check_points(points: np.ndarray, frame: int, least: int) -> np.ndarray:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import open3d as o3d
 
 from geomocap.errors import GeometryError
-from geomocap.files.atomic import write_atomic
-from geomocap.files.open3d_geometry import read_by_open3d
 from geomocap.model.palette import body_colors
+
+GREY = 150
 
 
 class Geometry(Protocol):
@@ -77,36 +76,13 @@ class Voxels:
         indices = np.array([v.grid_index for v in voxels], dtype=np.int32).reshape(-1, 3)
         colors = np.array([v.color for v in voxels]).reshape(-1, 3)
         colors = np.clip(np.rint(colors * 255), 0, 255).astype(np.uint8)
-        return cls._sorted(indices, colors, np.array(grid.origin), float(grid.voxel_size))
+        return cls.sorted(indices, colors, np.array(grid.origin), float(grid.voxel_size))
 
     @classmethod
-    def _sorted(cls, indices: np.ndarray, colors: np.ndarray, origin: np.ndarray, voxel_size: float) -> Voxels:
+    def sorted(cls, indices: np.ndarray, colors: np.ndarray, origin: np.ndarray, voxel_size: float) -> Voxels:
+        """Return voxels sorted by x, y, z index."""
         order = np.lexsort(indices.T[::-1])
         return cls(indices[order], colors[order], origin, voxel_size)
-
-    def write(self, path: Path) -> None:
-        """Write as PLY, whole or not at all."""
-        grid = self.to_open3d()
-        write_atomic(path, lambda p: o3d.io.write_voxel_grid(p, grid))
-
-    @classmethod
-    def read(cls, path: Path) -> Voxels:
-        """Read a voxel grid's PLY.
-
-        Raises
-        ------
-        GeometryError
-            If the file is missing or holds no voxels.
-        """
-        if not path.is_file():
-            raise GeometryError(f"{path}: no such voxel grid")
-        voxels = _read_binary(path)
-        if voxels is not None:
-            return cls._sorted(*voxels)
-        grid = read_by_open3d(o3d.io.read_voxel_grid, path)
-        if not grid.has_voxels():
-            raise GeometryError(f"{path}: no readable voxel grid; make it again")
-        return cls.from_open3d(grid)
 
 
 @dataclass(frozen=True)
@@ -118,10 +94,34 @@ class BodyPoints:
     positions : (N, 3) float, metres, world
     body : (N,) int
         Body of each point, -1: none.
+    colors : (N, 3) uint8, RGB, optional
+    normals : (N, 3) float, optional
     """
 
     positions: np.ndarray
     body: np.ndarray
+    colors: np.ndarray | None = None
+    normals: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.positions)
+        expected = {"positions": (count, 3), "body": (count,), "colors": (count, 3), "normals": (count, 3)}
+        for name, shape in expected.items():
+            array = getattr(self, name)
+            if array is not None and array.shape != shape:
+                raise GeometryError(f"points: {name} of shape {array.shape}, expected {shape}")
+
+    @property
+    def shown_colors(self) -> np.ndarray:
+        """Colours, (N, 3) uint8, RGB; grey where none are known."""
+        return np.full(self.positions.shape, GREY, np.uint8) if self.colors is None else self.colors
+
+    @property
+    def finite(self) -> BodyPoints:
+        """Those of the points that have a position."""
+        keep = np.isfinite(self.positions).all(axis=1)
+        arrays = (self.positions, self.body, self.colors, self.normals)
+        return BodyPoints(*(None if a is None else a[keep] for a in arrays))  # type: ignore[arg-type]
 
     def to_open3d(self) -> o3d.t.geometry.PointCloud:
         """Return the tensor point cloud with attributes `body` (int32) and `colors` (one a body)."""
@@ -130,92 +130,3 @@ class BodyPoints:
         cloud.point["body"] = np.ascontiguousarray(self.body, np.int32)[:, None]  # type: ignore[call-overload]
         cloud.point["colors"] = body_colors(self.body)  # type: ignore[call-overload]
         return cloud
-
-    def write(self, path: Path) -> None:
-        """Write as PLY, whole or not at all."""
-        cloud = self.to_open3d()
-        write_atomic(path, lambda p: o3d.t.io.write_point_cloud(p, cloud))
-
-    @classmethod
-    def read(cls, path: Path) -> BodyPoints:
-        """Read points with their bodies.
-
-        Raises
-        ------
-        GeometryError
-            If the file is missing or has no attribute `body`.
-        """
-        if not path.is_file():
-            raise GeometryError(f"{path}: no such point cloud")
-        cloud = read_by_open3d(o3d.t.io.read_point_cloud, path)
-        if "body" not in cloud.point:
-            raise GeometryError(f"{path}: has no attribute `body`; delete it and run again")
-        return cls(cloud.point.positions.numpy().astype(np.float64), cloud.point["body"].numpy().ravel())
-
-
-def read_cloud(path: Path) -> np.ndarray:
-    """Read the positions of a point cloud file, (N, 3) float, in the file's order.
-
-    Raises
-    ------
-    GeometryError
-        If the file is missing or holds no points.
-    """
-    if not path.is_file():
-        raise GeometryError(f"{path}: no such point cloud")
-    cloud = read_by_open3d(o3d.t.io.read_point_cloud, path)
-    if "positions" not in cloud.point or not len(cloud.point.positions):
-        raise GeometryError(f"{path}: holds no points; delete it and run again")
-    return cloud.point.positions.numpy().astype(np.float64)
-
-
-def read_cloud_colors(path: Path) -> np.ndarray:
-    """Read the colours of a point cloud file, (N, 3) uint8, in the file's order.
-
-    Raises
-    ------
-    GeometryError
-        If the file is missing or its points have no colours.
-    """
-    if not path.is_file():
-        raise GeometryError(f"{path}: no such point cloud")
-    cloud = read_by_open3d(o3d.t.io.read_point_cloud, path)
-    if "colors" not in cloud.point:
-        raise GeometryError(f"{path}: its points have no colours; delete it and run again")
-    return cloud.point.colors.numpy()
-
-
-_HEADER = b"""ply
-format binary_little_endian 1.0
-comment Created by Open3D
-element origin 1
-property double x
-property double y
-property double z
-element rotation 1
-"""
-_VOXEL = np.dtype([("index", "<f8", 3), ("color", "u1", 3)])
-
-
-def _read_binary(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
-    """Read a voxel grid as Open3D writes it, a hundred times faster than voxel by voxel; None if it is another kind."""
-    data = path.read_bytes()
-    head, _, body = data.partition(b"end_header\n")
-    lines = head.decode("ascii", "replace").splitlines()
-    vertex = [line for line in lines if line.startswith("element vertex ")]
-    properties = [line for line in lines[lines.index(vertex[0]) + 1 :]] if vertex else []
-    if not data.startswith(_HEADER) or properties != [
-        "property double x",
-        "property double y",
-        "property double z",
-        "property uchar red",
-        "property uchar green",
-        "property uchar blue",
-    ]:
-        return None
-    count = int(vertex[0].split()[-1])
-    frame = np.frombuffer(body, "<f8", 13)  # origin, rotation, voxel size
-    if len(body) != 13 * 8 + count * _VOXEL.itemsize or not np.array_equal(frame[3:12].reshape(3, 3), np.eye(3)):
-        return None
-    voxels = np.frombuffer(body, _VOXEL, count, 13 * 8)
-    return voxels["index"].astype(np.int32), np.array(voxels["color"]), np.array(frame[:3]), float(frame[12])

@@ -6,9 +6,8 @@ minus 0.5.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -68,71 +67,6 @@ class Rig:
         object.__setattr__(self, "names", state["names"])
         object.__setattr__(self, "cameras", cameras)
         object.__setattr__(self, "cam_from_world", state["cam_from_world"])
-
-    # --- reading and writing ---
-
-    @classmethod
-    def read(cls, sparse: Path, names: Sequence[str] | None = None) -> Rig:
-        """Read a COLMAP model whose image names begin with the camera's name (`<camera>/<anything>`).
-
-        Parameters
-        ----------
-        sparse : Path
-            Folder of a COLMAP model, text or binary.
-        names : sequence of str, optional
-            The cameras wanted, in this order; all of them, sorted by name, if not given.
-
-        Raises
-        ------
-        CalibrationError
-            If the folder holds no model, or a camera has no posed image, or two images disagree about its pose.
-        """
-        try:
-            model = pycolmap.Reconstruction(str(sparse))
-        except Exception as error:
-            raise CalibrationError(f"{sparse}: no readable COLMAP model ({_first_line(error)})") from None
-        found: dict[str, tuple[pycolmap.Camera, np.ndarray]] = {}
-        for image in sorted(model.images.values(), key=lambda i: i.name):
-            if not image.has_pose:
-                continue
-            name = image.name.split("/")[0] if "/" in image.name else Path(image.name).stem
-            pose = image.cam_from_world().matrix()
-            if name in found and not np.allclose(found[name][1], pose, atol=1e-9):
-                raise CalibrationError(
-                    f"{sparse}: images of camera {name} have different poses, but cameras must not move; "
-                    f"keep one image {name}/<anything>"
-                )
-            found.setdefault(name, (model.cameras[image.camera_id], pose))
-        wanted = tuple(sorted(found)) if names is None else tuple(names)
-        for name in wanted:
-            if name not in found:
-                raise CalibrationError(
-                    f"{sparse}: no posed image of camera {name}; the model has {', '.join(sorted(found)) or 'none'}"
-                )
-        return cls(
-            wanted,
-            tuple(found[n][0] for n in wanted),
-            np.array([found[n][1] for n in wanted]).reshape(-1, 3, 4),
-        )
-
-    def reconstruction(self) -> pycolmap.Reconstruction:
-        """Return the rig as a COLMAP model with one image `<camera>/000000.png` a camera and no points."""
-        model = pycolmap.Reconstruction()
-        for i, (name, camera, pose) in enumerate(zip(self.names, self.cameras, self.cam_from_world, strict=True)):
-            copy = pycolmap.Camera(camera.todict())
-            copy.camera_id = i + 1
-            model.add_camera_with_trivial_rig(copy)
-            image = pycolmap.Image(name=f"{name}/000000.png", camera_id=i + 1, image_id=i + 1)
-            rotation = pycolmap.Rotation3d(np.array(pose[:, :3]))
-            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(rotation, np.array(pose[:, 3])))
-        return model
-
-    def write(self, sparse: Path) -> None:
-        """Write the rig as a COLMAP text model into the folder `sparse`, which is made if need be."""
-        sparse.mkdir(parents=True, exist_ok=True)
-        self.reconstruction().write_text(str(sparse))
-
-    # --- values ---
 
     def select(self, names: Iterable[str]) -> Rig:
         """Return the rig of these cameras only, in this order."""
@@ -255,7 +189,3 @@ class Rig:
         source = self.cameras[camera].img_from_cam(np.column_stack([normalized, np.ones(len(normalized))]))
         source = np.nan_to_num(source.astype(np.float32) - np.float32(0.5), nan=-1e6)
         return source[:, 0].reshape(x.shape), source[:, 1].reshape(x.shape)
-
-
-def _first_line(error: BaseException) -> str:
-    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -14,7 +14,7 @@ import open3d as o3d
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from geomocap.export.export_errors import MotionError
+from geomocap.errors import GeometryError
 
 FEWEST_POINTS = 50
 MOST_CELLS = 40_000_000  # of the grid in which a shell is filled
@@ -53,12 +53,12 @@ def surface_through(points: np.ndarray, normals: np.ndarray | None = None, max_t
 
     Raises
     ------
-    MotionError
+    GeometryError
         If there are too few points for a surface.
     """
     points = np.asarray(points, float)
     if len(points) < FEWEST_POINTS:
-        raise MotionError(f"skin: {len(points)} points are too few for a surface; choose another reference frame")
+        raise GeometryError(f"{len(points)} points are too few for a surface; choose another reference frame")
     spacing = point_spacing(points)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.normals = o3d.utility.Vector3dVector(outward_normals(points) if normals is None else normals)
@@ -69,7 +69,7 @@ def surface_through(points: np.ndarray, normals: np.ndarray | None = None, max_t
         if len(mesh.triangles) <= max_triangles:
             break
     if len(mesh.triangles) == 0:
-        raise MotionError("skin: no surface could be laid through the points; choose another reference frame")
+        raise GeometryError("no surface could be laid through the points; choose another reference frame")
     mesh.compute_vertex_normals()
     return Surface(np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals), np.asarray(mesh.triangles))
 
@@ -93,7 +93,7 @@ def point_spacing(points: np.ndarray) -> float:
     distance = cKDTree(points).query(points, k=2)[0][:, 1]
     positive = distance[distance > 0]
     if len(positive) == 0:
-        raise MotionError("skin: all points lie in one place; there is no surface")
+        raise GeometryError("all points lie in one place; there is no surface")
     return float(np.median(positive))
 
 

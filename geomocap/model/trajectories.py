@@ -85,6 +85,25 @@ class Trajectories:
             if getattr(self, name).shape != shape:
                 raise GeometryError(f"trajectories: {name} has shape {getattr(self, name).shape}, expected {shape}")
 
+    @classmethod
+    def of_positions(cls, positions: np.ndarray, **known: np.ndarray) -> Trajectories:
+        """Return trajectories of which only the positions (N, T, 3) are known, and what else is named."""
+        if positions.ndim != 3:
+            raise GeometryError(f"trajectories: positions have shape {positions.shape}, expected (N, T, 3)")
+        count, frames = positions.shape[:2]
+        unknown = {
+            "rotations": np.broadcast_to(np.nan, (count, frames, 3, 3)),
+            "sigma": np.broadcast_to(np.nan, (count, frames)),
+            "correlation": np.broadcast_to(np.nan, (count, frames)),
+            "n_views": np.isfinite(positions).all(axis=2).astype(int),
+            "ray": np.broadcast_to(0.0, (count, frames, 3)),
+            "normals": np.zeros((count, 3)),
+            "placed": np.zeros(count, int),
+            "end_reason": np.full(count, LAST_FRAME),
+            "begin_reason": np.full(count, LAST_FRAME),
+        }
+        return cls(positions, **{**unknown, **known})
+
     def __len__(self) -> int:
         return len(self.positions)
 
@@ -130,3 +149,53 @@ class Trajectories:
         """Count why the trajectories end."""
         found = Counter(int(r) for r in self.end_reason)
         return {REASONS[r]: found[r] for r in sorted(found)}
+
+
+@dataclass(frozen=True)
+class PathDerivatives:
+    """Smoothed motion of N points over T frames; NaN where too few frames are near.
+
+    Attributes
+    ----------
+    velocities : (N, T, 3) float, m/s
+    accelerations : (N, T, 3) float, m/s²
+    velocity_std, acceleration_std : (N, T) float
+        Standard deviation of each coordinate that the measurement's noise leaves.
+    """
+
+    velocities: np.ndarray
+    accelerations: np.ndarray
+    velocity_std: np.ndarray
+    acceleration_std: np.ndarray
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Trajectories as they are stored: filtered, with their motion.
+
+    Attributes
+    ----------
+    trajectories : Trajectories
+        (N, T, …), those that the filters left.
+    motion : PathDerivatives
+        Of the same points.
+    unfiltered : (M, T, 3) float, metres, optional
+        All trajectories before the filters.
+    kept : (N,) int, optional
+        Row of each trajectory in `unfiltered`.
+    """
+
+    trajectories: Trajectories
+    motion: PathDerivatives
+    unfiltered: np.ndarray | None = None
+    kept: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        shape = self.trajectories.positions.shape
+        if self.motion.velocities.shape != shape:
+            raise GeometryError(f"tracks: velocities have shape {self.motion.velocities.shape}, expected {shape}")
+        if (self.unfiltered is None) != (self.kept is None):
+            raise GeometryError("tracks: unfiltered trajectories go with the rows of those kept")
+        if self.unfiltered is not None and self.kept is not None:
+            if len(self.kept) != shape[0] or (self.kept >= len(self.unfiltered)).any():
+                raise GeometryError(f"tracks: {len(self.kept)} rows of {len(self.unfiltered)} for {shape[0]} tracks")

@@ -10,7 +10,7 @@ from geomocap.settings import Settings
 class NodeTrackingSettings(Settings):
     """How nodes of a surface are followed through point sets."""
 
-    nodes: int = Field(1000, ge=20, description="nodes to follow")
+    nodes: int = Field(1000, ge=20, description="nodes to follow", json_schema_extra={"flag": "nodes"})
     coarse_nodes: int = Field(220, ge=10, description="nodes of the coarse graph that finds the motion first")
     points: int = Field(5000, ge=100, description="points of a frame that are used (points)")
     coarse_points: int = Field(
@@ -28,7 +28,11 @@ class NodeTrackingSettings(Settings):
         0.3, ge=0, description="cost of a motion that doesn't go on, relative to unexplained points"
     )
     point_weight: float = Field(0.05, ge=0, le=1, description="pull along the surface relative to that across it")
-    colors: bool = Field(True, description="whether the points' colours guide the nodes, where there are any")
+    colors: bool = Field(
+        True,
+        description="whether the points' colours guide the nodes, where there are any",
+        json_schema_extra={"flag": "node-colors"},
+    )
     feature_weight: float = Field(1.0, ge=0, description="pull of features (colours) relative to that of the geometry")
     anchor_weight: float = Field(
         4.0, ge=0, description="pull of a trajectory that is known from the images relative to that of a point"

@@ -26,10 +26,20 @@ class TrackingSettings(Settings):
     Bodies come out better from the longer tracks of "updated".
     """
 
-    n_patches: int = Field(4000, ge=10, le=100_000, description="Patches placed on a frame's whole surface")
+    n_patches: int = Field(
+        4000,
+        ge=10,
+        le=100_000,
+        description="Patches placed on a frame's whole surface",
+        json_schema_extra={"flag": "patches"},
+    )
     radius_px: int = Field(5, ge=2, le=20, description="Half the width of a patch, at most (pixels)")
     reduction: int | None = Field(
-        None, ge=1, le=16, description="Reduction of the images; so that patches cover the surface twice if not given"
+        None,
+        ge=1,
+        le=16,
+        description="Reduction of the images; so that patches cover the surface twice if not given",
+        json_schema_extra={"flag": "reduction"},
     )
     blurs_px: tuple[float, float] = Field((2.5, 0.8), description="Blur of the coarse and the fine level (pixels)")
     templates: Literal["first", "updated", "previous"] = Field(

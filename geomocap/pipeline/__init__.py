@@ -1,6 +1,7 @@
 """The stages of a run in their order, each doing first what it needs and is missing or out of date."""
 
-from geomocap.pipeline.cloud_stage import clouds, read_cloud_record
+from geomocap.files.results import read_cloud_record
+from geomocap.pipeline.cloud_stage import clouds
 from geomocap.pipeline.export_stage import motion_files
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.segmentation_stage import segment

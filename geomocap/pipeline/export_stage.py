@@ -5,6 +5,7 @@ from __future__ import annotations
 from geomocap.export.run_export import FILES, export_run
 from geomocap.files.atomic import fingerprint
 from geomocap.files.run import stage_key
+from geomocap.pipeline.check_stage import check
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.segmentation_stage import segment
 from geomocap.pipeline.sources import Source
@@ -16,8 +17,9 @@ def motion_files(job: Job, source: Source) -> str:
     segmented = segment(job, source)
     if not (job.run.path / "skeleton.npz").exists():
         return segmented
+    check(job, segmented)
     beside = fingerprint(job.run.path / name for name in ("names.toml", "keypoints.npz"))
-    key = stage_key("export", segmented, job.config.export.model_dump(), job.up, beside)
+    key = stage_key(__name__, "export", segmented, job.config.export.model_dump(), job.up, beside)
 
     def work() -> int:
         written = export_run(job.run, settings=job.config.export, progress=job.progress)

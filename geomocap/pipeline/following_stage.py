@@ -9,20 +9,28 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geomocap.files.atomic import fingerprint
+from geomocap.files.results import (
+    WARNINGS,
+    read_trajectories,
+    write_diagnostics,
+    write_ellipsoids,
+    write_points,
+    write_skeleton,
+    write_warnings,
+)
 from geomocap.files.run import Run, stage_key
+from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.ellipsoids import Ellipsoids, fit_ellipsoids
 from geomocap.model.frame_geometry import BodyPoints, Geometry
+from geomocap.model.skeleton import Skeleton, bone_fixed_skeleton
 from geomocap.pipeline.derived import FROM_BODIES
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.path_choice import OF_TRACKS, patch_paths, point_paths
+from geomocap.pipeline.path_choice import patch_paths, point_paths
 from geomocap.pipeline.track_stage import tracks
-from geomocap.pipeline.warnings import WARNINGS_FILE, write_warnings
 from geomocap.scheduling import map_items
 from geomocap.skeleton.kinematics import BodyMotion, posed, since
-from geomocap.skeleton.m3_skeleton import Skeleton
-from geomocap.skeleton.motion_skeleton import skeleton_of_motion
 from geomocap.subject.model_following import FollowedSequence, follow_model
-from geomocap.subject.subject_model import MODEL_FILE, SubjectModel, read_model
+from geomocap.subject.subject_model import MODEL_FILE, SubjectModel, read_model, write_model
 
 
 def segment_with_model(job: Job, geometry: Geometry, source_key: str) -> str:
@@ -34,6 +42,7 @@ def segment_with_model(job: Job, geometry: Geometry, source_key: str) -> str:
     if job.capture is not None and wanted != "nodes":
         patches = tracks(job)
     key = stage_key(
+        __name__,
         "following",
         source_key,
         patches,
@@ -45,7 +54,7 @@ def segment_with_model(job: Job, geometry: Geometry, source_key: str) -> str:
     )
     outputs = ["ellipsoids.npz", "bodies", "diagnostics.npz", "skeleton.npz", MODEL_FILE]
     work = partial(_follow, job, geometry, model, patches is not None)
-    return job.stage("segmentation", key, outputs, work, [WARNINGS_FILE, *FROM_BODIES])
+    return job.stage("segmentation", key, outputs, work, [WARNINGS, *FROM_BODIES])
 
 
 def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) -> int:
@@ -62,26 +71,24 @@ def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) ->
             frames,
             geometry.spacing,
             job.up_axis,
-            patch_paths(job.run.read_npz("tracks.npz", OF_TRACKS)) if patches else point_paths(job, geometry),
+            patch_paths(read_trajectories(job.run)) if patches else point_paths(job, geometry),
             job.config.following,
             job.progress,
         )
         count["items"] = frames
     label = _Label(geometry, job.run, model, followed.bodies)
     fitted = list(map_items(label, range(frames), job.executor, "labels", job.progress))
-    names = ("centers", "radii", "rotations", "counts", "errors")
-    together = {name: np.stack([getattr(e, name) for e in fitted]) for name in names}
-    job.run.write_npz("ellipsoids.npz", **together, body=np.arange(model.body_count, dtype=np.int32))
-    job.run.write_npz("skeleton.npz", **_skeleton(model, followed, job.fps).arrays())
-    job.run.write_npz(MODEL_FILE, **model.widened(followed.bodies).reposed(followed.bodies, 0).arrays())
-    job.run.write_npz(
-        "diagnostics.npz",
-        paths=np.array("model"),
+    write_ellipsoids(job.run, Ellipsoids.stack(fitted, np.arange(model.body_count, dtype=np.int32)))
+    write_skeleton(job.run, _skeleton(model, followed, job.fps))
+    write_model(job.run.path / MODEL_FILE, model.widened(followed.bodies).reposed(followed.bodies, 0))
+    made = Diagnostics(
+        paths="model",
         fit_distance=followed.distance,
         first_frame=followed.first_frame,
         joint_is_hinge=model.joint_hinge,
         joint_axes=posed(model.linkage, followed.bodies, 0).axes,
     )
+    write_diagnostics(job.run, made)
     write_warnings(job.run, _fit_warnings(model, followed, job.config.following.poor_fit))
     return frames
 
@@ -95,7 +102,7 @@ def _skeleton(model: SubjectModel, followed: FollowedSequence, fps: float) -> Sk
     middle = np.stack([p.mean(axis=0) if len(p) else linkage.joints[own[b]] for b, p in enumerate(places)])
     centers = np.einsum("tbij,bj->tbi", motion.rotations, middle) + motion.translations
     joints = linkage.joint_positions(motion)
-    found = skeleton_of_motion(linkage.hierarchy, linkage.joints, motion.rotations, joints, centers, middle, fps)
+    found = bone_fixed_skeleton(linkage.hierarchy, linkage.joints, motion.rotations, joints, centers, middle, fps)
     return replace(found, joint_names=model.joint_names, body_names=model.body_names)
 
 
@@ -128,5 +135,5 @@ class _Label:
         skin = self.model.skin
         placed = self.bodies.part(slice(frame, frame + 1)).carry(skin.rest, skin.bodies, skin.fractions)[0]
         label = skin.body[cKDTree(placed).query(points)[1]].astype(np.int32)
-        BodyPoints(points, label).write(self.run.frame_file("bodies", frame))
+        write_points(self.run.frame_file("bodies", frame), BodyPoints(points, label))
         return fit_ellipsoids(points, label, self.model.body_count, self.geometry.spacing)

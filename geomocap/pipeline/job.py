@@ -10,12 +10,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import geomocap
 from geomocap.config import Config
 from geomocap.files.capture import Capture
 from geomocap.files.run import Run
 from geomocap.files.scans import Scans
 from geomocap.progress import Progress, silent
+from geomocap.version import __version__
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Job:
         packages = ("numpy", "scipy", "numba", "open3d", "opencv-python-headless", "pycolmap", "trimesh")
         self.run.write_record(
             {
-                "geomocap": {"version": geomocap.__version__},
+                "geomocap": {"version": __version__},
                 "source": source if model is None else {**source, "model": model},
                 "versions": {"python": platform.python_version(), **{p: version(p) for p in packages}},
                 "config": {k: table if k in tables else kept.get(k, table) for k, table in settings.items()},

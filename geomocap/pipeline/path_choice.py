@@ -5,16 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from geomocap.errors import GeometryError
+from geomocap.files.results import read_trajectories
 from geomocap.files.scan_tracks import scan_tracks
 from geomocap.files.scans import Scans
 from geomocap.model.frame_geometry import Geometry
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.trajectories import Trajectories
 from geomocap.nodes.node_tracking import track_nodes
 from geomocap.pipeline.job import Job
 from geomocap.segmentation.m3 import ellipsoid_paths
 from geomocap.trajectories.selection import spread_out
 
-OF_TRACKS = ("positions", "sigma", "ray")  # what motion paths are made from
 SAMPLES = 2000  # motion paths that bodies are found from
 ALONE_FRACTION = (
     0.5  # of the standard deviation of what a single camera sees, as most of that is depth and hardly counts
@@ -48,7 +49,7 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> tuple[Motion
         settings = job.config.segmentation
         found = ellipsoid_paths(geometry.points, len(geometry), geometry.spacing, settings, job.executor, job.progress)
         return MotionPaths(found.ellipsoids.centers.swapaxes(0, 1)), wanted
-    tracked = job.run.read_npz("tracks.npz", OF_TRACKS) if has_tracks else None
+    tracked = read_trajectories(job.run) if has_tracks else None
     if tracked is not None and wanted != "both":
         paths = patch_paths(tracked)
         if paths is not None and (wanted == "patches" or _covers(paths)):
@@ -81,26 +82,26 @@ def point_paths(job: Job, geometry: Geometry) -> MotionPaths | None:
     return None if tracks is None else MotionPaths(tracks[spread_out(tracks, SAMPLES)])
 
 
-def patch_paths(tracked: dict[str, np.ndarray]) -> MotionPaths | None:
+def patch_paths(tracked: Trajectories) -> MotionPaths | None:
     """Long trajectories, evenly over the surface; None: there are none."""
-    chosen = spread_out(tracked["positions"], SAMPLES)
+    chosen = spread_out(tracked.positions, SAMPLES)
     if not len(chosen):
         return None
-    sigma = tracked["sigma"][chosen].astype(float)
+    sigma = tracked.sigma[chosen].astype(float)
     # standard deviations with the median where a sample was not seen
     sigma = np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma))
-    ray = tracked["ray"][chosen].astype(float) if "ray" in tracked else np.zeros((*sigma.shape, 3))
+    ray = tracked.ray[chosen].astype(float)
     alone = ray.any(axis=2)
     if not alone.any():
-        return MotionPaths(tracked["positions"][chosen], sigma=sigma)
-    return MotionPaths(tracked["positions"][chosen], sigma=np.where(alone, ALONE_FRACTION, 1.0) * sigma, ray=ray)
+        return MotionPaths(tracked.positions[chosen], sigma=sigma)
+    return MotionPaths(tracked.positions[chosen], sigma=np.where(alone, ALONE_FRACTION, 1.0) * sigma, ray=ray)
 
 
 def _covers(paths: MotionPaths) -> bool:
     return paths.count >= LEAST_SAMPLES and float(paths.seen.mean()) >= LEAST_COVERAGE
 
 
-def _anchors(tracked: dict[str, np.ndarray]) -> np.ndarray | None:
+def _anchors(tracked: Trajectories) -> np.ndarray | None:
     """Trajectories (P, T, 3), metres, that nodes are held by; None: there are none."""
-    chosen = spread_out(tracked["positions"], ANCHORS, ANCHOR_FRACTION)
-    return tracked["positions"][chosen] if len(chosen) else None
+    chosen = spread_out(tracked.positions, ANCHORS, ANCHOR_FRACTION)
+    return tracked.positions[chosen] if len(chosen) else None

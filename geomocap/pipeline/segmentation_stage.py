@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from geomocap.errors import SettingsError
+from geomocap.files.results import WARNINGS, write_diagnostics, write_ellipsoids, write_points, write_skeleton
 from geomocap.files.run import Run, stage_key
+from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.frame_geometry import BodyPoints, Geometry
 from geomocap.pipeline.cloud_stage import bounds_of
 from geomocap.pipeline.derived import FROM_BODIES
@@ -15,7 +17,6 @@ from geomocap.pipeline.job import Job
 from geomocap.pipeline.motion_stage import segment_by_motion
 from geomocap.pipeline.sources import Source, geometry_of
 from geomocap.pipeline.track_stage import tracks
-from geomocap.pipeline.warnings import WARNINGS_FILE
 from geomocap.scheduling import map_items
 from geomocap.segmentation.m3 import segment_m3
 from geomocap.segmentation.m3_result import Segmentation
@@ -35,10 +36,10 @@ def segment(job: Job, source: Source) -> str:
     has_tracks = by_motion and _is_tracked(job, source)
     tables = ("nodes", "motion_bodies", "motion_skeleton", "refinement") if by_motion else ("skeleton",)
     settings = {name: getattr(config, name).model_dump() for name in ("segmentation", *tables)}
-    outputs, optional = ["ellipsoids.npz", "bodies", "diagnostics.npz"], [MODEL_FILE, WARNINGS_FILE, *FROM_BODIES]
+    outputs, optional = ["ellipsoids.npz", "bodies", "diagnostics.npz"], [MODEL_FILE, WARNINGS, *FROM_BODIES]
     # a single frame has no motion to tell bodies and joints by
     (outputs if len(geometry) > 1 else optional).append("skeleton.npz")
-    key = stage_key("segmentation", source_key, tracks(job) if has_tracks else None, settings, job.fps)
+    key = stage_key(__name__, "segmentation", source_key, tracks(job) if has_tracks else None, settings, job.fps)
     work = partial(segment_by_motion, has_tracks=has_tracks) if by_motion else segment_as_m3
     return job.stage("segmentation", key, outputs, lambda: work(job, geometry), optional)
 
@@ -64,14 +65,13 @@ def segment_as_m3(job: Job, geometry: Geometry) -> int:
     write = _WriteBodies(geometry, job.run, found)
     for _ in map_items(write, range(frames), job.executor, "bodies", job.progress):
         pass
-    job.run.write_npz("ellipsoids.npz", **found.arrays())
+    write_ellipsoids(job.run, replace(found.ellipsoids, body=found.body))
     if frames > 1:
         with job.run.timed("skeleton") as count:
             skeleton = skeleton_m3(found, job.fps, job.config.skeleton)
-            job.run.write_npz("skeleton.npz", **skeleton.arrays())
+            write_skeleton(job.run, skeleton)
             count["items"] = frames
-    job.run.write_npz(
-        "diagnostics.npz",
+    made = Diagnostics(
         integrals=found.integrals,
         threshold=found.threshold,
         seeds=found.seeds,
@@ -79,6 +79,7 @@ def segment_as_m3(job: Job, geometry: Geometry) -> int:
         touching=found.touching,
         body=found.body,
     )
+    write_diagnostics(job.run, made)
     return frames
 
 
@@ -92,4 +93,4 @@ class _WriteBodies:
 
     def __call__(self, frame: int) -> None:
         points = BodyPoints(self.geometry.points(frame), self.found.body_labels(frame))
-        points.write(self.run.frame_file("bodies", frame))
+        write_points(self.run.frame_file("bodies", frame), points)

@@ -17,14 +17,10 @@ from geomocap.files.capture import Capture
 from geomocap.files.run import Run, stage_key
 from geomocap.pipeline.job import Job
 from geomocap.scheduling import map_items
-from geomocap.silhouettes import (
-    BackgroundModel,
-    SilhouetteSettings,
-    model_from_frames,
-    model_from_plate,
-    region_of_points,
-    silhouette,
-)
+from geomocap.silhouettes.background import BackgroundModel, model_from_frames, model_from_plate
+from geomocap.silhouettes.extraction import silhouette
+from geomocap.silhouettes.region import region_of_points
+from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 
 def silhouettes(job: Job) -> str:
@@ -33,6 +29,7 @@ def silhouettes(job: Job) -> str:
     if capture is None:
         raise CaptureError("silhouettes need a capture")
     key = stage_key(
+        __name__,
         "silhouettes",
         str(capture.path.resolve()),
         capture.fingerprint("images", "videos", "background", "masks", "sparse"),

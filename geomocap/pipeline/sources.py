@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from geomocap.errors import GeometryError
+from geomocap.files.frame_files import read_points, read_voxels
 from geomocap.files.run import Run, stage_key
 from geomocap.files.scans import point_spacing
-from geomocap.model.frame_geometry import Geometry, Voxels, read_cloud, read_cloud_colors
+from geomocap.model.frame_geometry import Geometry
 from geomocap.pipeline.cloud_stage import clouds
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.voxel_stage import voxels
@@ -28,18 +30,18 @@ class VoxelFrames:
     @property
     def spacing(self) -> float:
         """Edge of a voxel, metres."""
-        return Voxels.read(self.run.frame_file("voxels", 0)).voxel_size
+        return read_voxels(self.run.frame_file("voxels", 0)).voxel_size
 
     def __len__(self) -> int:
         return self.frames
 
     def points(self, frame: int) -> np.ndarray:
         """Voxel centres of one frame, (N, 3) float, metres, world."""
-        return Voxels.read(self.run.frame_file("voxels", frame)).points
+        return read_voxels(self.run.frame_file("voxels", frame)).points
 
     def features(self, frame: int) -> np.ndarray:
         """Colours of the voxels, (N, 3) float, 0 to 1."""
-        return Voxels.read(self.run.frame_file("voxels", frame)).colors / 255.0
+        return read_voxels(self.run.frame_file("voxels", frame)).colors / 255.0
 
 
 @dataclass(frozen=True)
@@ -59,11 +61,18 @@ class CloudFrames:
 
     def points(self, frame: int) -> np.ndarray:
         """Points of one frame, (N, 3) float, metres, world."""
-        return read_cloud(self.run.frame_file("cloud", frame))
+        return read_points(self.run.frame_file("cloud", frame)).positions
 
     def features(self, frame: int) -> np.ndarray:
         """Colours of the points, (N, 3) float, 0 to 1."""
-        return read_cloud_colors(self.run.frame_file("cloud", frame)) / 255.0
+        return _colors(self.run.frame_file("cloud", frame)) / 255.0
+
+
+def _colors(path: Path) -> np.ndarray:
+    colors = read_points(path).colors
+    if colors is None:
+        raise GeometryError(f"{path}: its points have no colours; delete it and run again")
+    return colors
 
 
 def geometry_of(job: Job, source: Source) -> tuple[Geometry, str]:
@@ -72,7 +81,7 @@ def geometry_of(job: Job, source: Source) -> tuple[Geometry, str]:
         if job.scans is None:
             raise GeometryError("no scans were given")
         settings = job.config.scans.model_dump(exclude={"up"})  # the points are the same
-        return job.scans, stage_key("scans", job.scans.fingerprint(), settings)
+        return job.scans, stage_key(__name__, "scans", job.scans.fingerprint(), settings)
     key = voxels(job) if source == "voxels" else clouds(job)
     assert job.capture is not None
     frames = job.capture.n_frames

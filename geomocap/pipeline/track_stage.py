@@ -7,19 +7,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from geomocap.carving.carving_settings import ENCLOSING
 from geomocap.carving.silhouette_views import Undistortion
 from geomocap.errors import CaptureError
 from geomocap.files.capture import Capture
-from geomocap.files.images import read_image
+from geomocap.files.frame_files import read_points, read_voxels
+from geomocap.files.results import read_silhouette, write_tracks
 from geomocap.files.run import Run, stage_key
 from geomocap.files.scans import point_spacing
-from geomocap.model.frame_geometry import Voxels, read_cloud
-from geomocap.model.trajectories import REASONS
+from geomocap.model.frame_geometry import Voxels
+from geomocap.model.trajectories import Tracks
 from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.patches.patch_tracking import track_surface
 from geomocap.patches.seeding import image_reduction
-from geomocap.pipeline.cloud_stage import HULL_CAMERAS, clouds
+from geomocap.pipeline.cloud_stage import clouds
 from geomocap.pipeline.derived import KEYPOINT_FILES
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.voxel_stage import voxels
@@ -42,7 +44,7 @@ def tracks(job: Job) -> str:
     tables = ("tracking", "filters", "smoothing")
     settings = {name: getattr(job.config, name).model_dump() for name in tables}
     surface = voxels(job) if _has_hull(capture) else clouds(job)
-    key = stage_key("tracks", surface, pictures, settings, job.fps)
+    key = stage_key(__name__, "tracks", surface, pictures, settings, job.fps)
     job.write_record(*tables)
     return job.stage("tracks", key, ["tracks.npz"], lambda: _track(job, capture), KEYPOINT_FILES)
 
@@ -58,39 +60,19 @@ def _track(job: Job, capture: Capture) -> int:
     del found
     kept = filtered.trajectories
     motion = smooth_motion(kept.positions, job.fps, kept.sigma, job.config.smoothing)
-    job.run.write_npz(
-        "tracks.npz",
-        positions=kept.positions,
-        velocities=motion.velocities,
-        accelerations=motion.accelerations,
-        start=kept.start,
-        end=kept.end,
-        sigma=kept.sigma,
-        correlation=kept.correlation,
-        n_views=kept.n_views,
-        ray=kept.ray.astype(np.float32),
-        velocity_std=motion.velocity_std,
-        acceleration_std=motion.acceleration_std,
-        normals=kept.normals,
-        placed=kept.placed,
-        begin_reason=kept.begin_reason,
-        end_reason=kept.end_reason,
-        reasons=list(REASONS),
-        unfiltered=unfiltered,
-        kept=filtered.kept,
-    )
+    write_tracks(job.run, Tracks(kept, motion, unfiltered, filtered.kept))
     return capture.n_frames
 
 
 def frame_reader(capture: Capture, run: Run, settings: TrackingSettings) -> Callable[[int], FrameViews]:
     """Return what reads the frames of a run for tracking; the first one tells how far images may be reduced."""
-    spacing = None if _has_hull(capture) else _CLOSED * point_spacing(read_cloud(run.frame_file("cloud", 0)))
+    spacing = None if _has_hull(capture) else _CLOSED * point_spacing(read_points(run.frame_file("cloud", 0)).positions)
     read = _ReadFrame(capture, run, settings, Undistortion.of(capture.rig), settings.reduction or 1, spacing)
     return read if settings.reduction else replace(read, reduction=image_reduction(read(0), settings))
 
 
 def _has_hull(capture: Capture) -> bool:
-    return len(capture.rig) >= HULL_CAMERAS
+    return len(capture.rig) >= ENCLOSING
 
 
 def surface_voxels(points: np.ndarray, size: float) -> Voxels:
@@ -114,9 +96,9 @@ class _ReadFrame:
     def __call__(self, frame: int) -> FrameViews:
         cameras = self.capture.cameras
         images = self.undistortion.images([self.capture.frame(c, frame) for c in cameras])
-        masks = [read_image(self.run.silhouette_file(c, frame), gray=True) for c in cameras]
+        masks = [read_silhouette(self.run, c, frame) for c in cameras]
         if self.cloud_spacing is None:
-            surface = Voxels.read(self.run.frame_file("voxels", frame))
+            surface = read_voxels(self.run.frame_file("voxels", frame))
         else:
-            surface = surface_voxels(read_cloud(self.run.frame_file("cloud", frame)), self.cloud_spacing)
+            surface = surface_voxels(read_points(self.run.frame_file("cloud", frame)).positions, self.cloud_spacing)
         return FrameViews.of(self.undistortion.views(masks), images, surface, self.settings.blurs_px, self.reduction)

@@ -15,7 +15,7 @@ from geomocap.carving.volume import working_volume
 from geomocap.carving.voxel_grid import Grid
 from geomocap.errors import CaptureError
 from geomocap.files.capture import Capture
-from geomocap.files.images import read_image
+from geomocap.files.results import read_silhouette, write_voxels
 from geomocap.files.run import Run, stage_key
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.silhouette_stage import silhouettes
@@ -32,7 +32,7 @@ def voxels(job: Job) -> str:
     settings = carving_settings(job, capture)
     _ = capture.rig  # what is wrong with the calibration is said before long work begins
     key = stage_key(
-        "voxels", silhouettes(job), capture.fingerprint("images", "videos", "sparse"), settings.model_dump()
+        __name__, "voxels", silhouettes(job), capture.fingerprint("images", "videos", "sparse"), settings.model_dump()
     )
     job.write_record("carving")
     return job.stage("voxels", key, ["voxels"], lambda: _carve_all(job, capture, settings))
@@ -77,7 +77,7 @@ class _Carve:
     def views(self, frame: int) -> PinholeViews:
         """Read the silhouettes of a frame as the pinhole cameras see them."""
         cameras = self.capture.cameras
-        return self.undistortion.views([read_image(self.run.silhouette_file(c, frame), gray=True) for c in cameras])
+        return self.undistortion.views([read_silhouette(self.run, c, frame) for c in cameras])
 
     def checked_views(self, frame: int) -> PinholeViews:
         """Read the silhouettes of a frame; an empty one is reported with the mask it was taken from."""
@@ -92,4 +92,4 @@ class _Carve:
         if needs_images(self.settings):
             images = self.undistortion.images([self.capture.frame(c, frame) for c in self.capture.cameras])
         found = carve_frame(self.checked_views(frame), self.grid, self.settings, images, frame)
-        found.write(self.run.frame_file("voxels", frame))
+        write_voxels(self.run.frame_file("voxels", frame), found)

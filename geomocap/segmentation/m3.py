@@ -11,7 +11,7 @@ import numpy as np
 from geomocap.errors import GeometryError
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items
-from geomocap.segmentation.body_turns import body_rotations
+from geomocap.segmentation.body_rotations import body_rotations
 from geomocap.segmentation.contacts import contacts_of_bodies
 from geomocap.segmentation.ellipsoid_matching import EllipsoidPaths, match_frames
 from geomocap.segmentation.ellipsoid_splitting import SplitFrame, split_frame

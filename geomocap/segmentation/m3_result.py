@@ -75,14 +75,3 @@ class Segmentation:
     def labels(self) -> tuple[np.ndarray, ...]:
         """Body of every point of every frame, T arrays (N_t,) int32."""
         return tuple(self.body_labels(frame) for frame in range(len(self.point_ellipsoids)))
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return the arrays of `ellipsoids.npz`."""
-        return {
-            "centers": self.ellipsoids.centers,
-            "radii": self.ellipsoids.radii,
-            "rotations": self.ellipsoids.rotations,
-            "counts": self.ellipsoids.counts,
-            "errors": self.ellipsoids.errors,
-            "body": self.body,
-        }

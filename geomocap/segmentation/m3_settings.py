@@ -15,6 +15,11 @@ class SegmentationSettings(Settings):
     method: Literal["motion", "m3"] = Field(
         default="motion",
         description="motion: bodies from how the tracked surface turns; m3: the paper's split, merge, match and paths",
+        json_schema_extra={
+            "flag": "method",
+            "evidence": "adjusted Rand index of all points / of the bodies' cores, synthetic man and horse walking, "
+            "version 0.1: motion 0.92 / 0.99 and 0.67 / 0.81, m3 0.19 / 0.19 and 0.23 / 0.30",
+        },
     )
     paths: Literal["auto", "patches", "nodes", "both", "points", "ellipsoids"] = Field(
         default="auto",
@@ -22,6 +27,11 @@ class SegmentationSettings(Settings):
         "not tracked at all); both: nodes that patches keep from sliding; points: those of scans which are the same in "
         "all frames; ellipsoids: the paper's, split, merged and matched, for comparison; auto: of a capture patches "
         "where they cover the subject, otherwise both; of scans points where neighbours stay so, otherwise nodes",
+        json_schema_extra={
+            "flag": "paths",
+            "evidence": "as above, but without soft borders and refinement: patches 0.81 / 0.97 and 0.64 / 0.75, nodes "
+            "0.67 / 0.85 and 0.48 / 0.59, ellipsoids 0.37 / 0.49 and 0.25 / 0.34",
+        },
     )
     max_depth: int = Field(
         default=7, ge=1, le=10, description="levels of splitting; at most 2^levels ellipsoids a frame"

@@ -11,7 +11,10 @@ class SilhouetteSettings(Settings):
     """How silhouettes are cut out. Evidence is in units of the log likelihood ratio subject : background."""
 
     samples: int = Field(
-        30, ge=2, description="Frames, spread over the recording, from which a camera's background is learnt."
+        30,
+        ge=2,
+        description="Frames, spread over the recording, from which a camera's background is learnt.",
+        json_schema_extra={"flag": "background-samples"},
     )
     repair: bool = Field(
         default=True,
@@ -24,9 +27,12 @@ class SilhouetteSettings(Settings):
         default=4.0,
         gt=0,
         description="Difference from the background at which a pixel is as likely subject (noise sigmas).",
+        json_schema_extra={"flag": "threshold"},
     )
     shadows: bool = Field(
-        default=True, description="Take darker background with the same colour and texture for shadow."
+        default=True,
+        description="Take darker background with the same colour and texture for shadow.",
+        json_schema_extra={"flag": "shadows"},
     )
     colors: bool = Field(
         default=True, description="Judge doubtful pixels by the colours that the subject has elsewhere."

@@ -11,26 +11,6 @@ _TURNED = 0.2
 _ROUNDS = 4
 
 
-def local_rotations(body_rotations: np.ndarray, hierarchy: Hierarchy) -> np.ndarray:
-    """Rotation of each body relative to its parent's frame; the root's relative to the world.
-
-    Parameters
-    ----------
-    body_rotations : (T, B, 3, 3) float
-        Since frame 0, world axes.
-    hierarchy : Hierarchy
-
-    Returns
-    -------
-    (T, B, 3, 3) float
-        parent from child; the identity in frame 0.
-    """
-    result = body_rotations.copy()
-    for parent, child in hierarchy.joint_bodies:
-        result[:, child] = np.einsum("tji,tjk->tik", body_rotations[:, parent], body_rotations[:, child])
-    return result
-
-
 def forward_kinematics(
     hierarchy: Hierarchy, offsets: np.ndarray, rotations: np.ndarray, root_positions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -42,7 +22,7 @@ def forward_kinematics(
     offsets : (J, 3) float, metres
         From the parent body's own joint (for the root: its position) to the joint, in the parent's frame.
     rotations : (T, B, 3, 3) float
-        Relative to the parent, see `local_rotations`.
+        Relative to the parent, see `Hierarchy.local_rotations`.
     root_positions : (T, 3) float, metres
 
     Returns

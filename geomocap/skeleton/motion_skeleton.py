@@ -5,40 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import Field
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.errors import GeometryError
-from geomocap.model.hierarchy import Hierarchy
-from geomocap.settings import Settings
+from geomocap.model.skeleton import Skeleton, bone_fixed_skeleton
 from geomocap.skeleton.articulated_adjustment import adjust
 from geomocap.skeleton.body_observations import Observations, SkinPoints
-from geomocap.skeleton.bone_motion import local_rotations
 from geomocap.skeleton.borders import Border, contacts, find_borders
 from geomocap.skeleton.common_points import CommonPoint, common_point
 from geomocap.skeleton.kinematics import BodyMotion, Linkage, joint_motion
-from geomocap.skeleton.m3_skeleton import Skeleton
+from geomocap.skeleton.motion_skeleton_settings import MotionSkeletonSettings
 from geomocap.skeleton.spanning_tree import Connection, connect_by_cost, connection_cost
-
-
-class MotionSkeletonSettings(Settings):
-    """How joints are found between bodies, and how these are connected."""
-
-    interface_prior: float = Field(
-        default=0.005,
-        gt=0,
-        description="least weight of the place where bodies touch (frames in which they turn by a radian)",
-    )
-    interface_weight: float = Field(
-        default=0.05, ge=0, description="tree: weight of a joint's distance from where its bodies touch (no unit)"
-    )
-    gap_weight: float = Field(default=0.05, ge=0, description="tree: weight of the bodies' distance (no unit)")
-    contact_weight: float = Field(
-        default=0.01, ge=0, description="tree: cost of bodies without common border (diagonals)"
-    )
-    largest_gap: float = Field(default=0.1, gt=0, description="bodies farther apart are not connected (diagonals)")
 
 
 @dataclass(frozen=True)
@@ -96,7 +75,7 @@ def find_motion_skeleton(
     motion = _connected_motion(linkage, bodies, middle)
     centers = np.einsum("tbij,bj->tbi", motion.rotations, middle) + motion.translations
     places = linkage.joint_positions(motion)
-    skeleton = skeleton_of_motion(hierarchy, joints, motion.rotations, places, centers, middle, fps)
+    skeleton = bone_fixed_skeleton(hierarchy, joints, motion.rotations, places, centers, middle, fps)
     costs = np.array([c.cost for c in chosen])
     return MotionSkeleton(skeleton, tuple(c.joint for c in chosen), costs, tuple(c.border for c in chosen))
 
@@ -148,50 +127,3 @@ def possible_connections(bodies: MotionBodies, settings: MotionSkeletonSettings)
 def _reached(borders: dict[tuple[int, int], Border], count: int) -> csr_matrix:
     rows, columns = np.array(list(borders), int).reshape(-1, 2).T
     return csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-
-
-def skeleton_of_motion(
-    hierarchy: Hierarchy,
-    joints: np.ndarray,
-    rotations: np.ndarray,
-    joint_positions: np.ndarray,
-    centers: np.ndarray,
-    middle: np.ndarray,
-    fps: float,
-) -> Skeleton:
-    """Skeleton of a motion whose joints are fixed in both bodies.
-
-    Parameters
-    ----------
-    hierarchy : Hierarchy
-    joints : (J, 3) float, metres, world
-        In frame 0.
-    rotations : (T, B, 3, 3) float
-        Since frame 0, world axes.
-    joint_positions : (T, J, 3) float, metres, world
-    centers : (T, B, 3) float, metres, world
-        Of the bodies.
-    middle : (B, 3) float, metres, world
-        Of the bodies in frame 0.
-    fps : float
-    """
-    own = hierarchy.body_joints
-    anchors = np.where((own >= 0)[:, None], joints[own] if len(joints) else middle, middle)
-    offsets = joints - anchors[hierarchy.joint_bodies[:, 0]]
-    names = np.array([f"body{b:02d}" for b in range(len(middle))])
-    joint_names = np.array([f"joint_{names[p]}_{names[c]}" for p, c in hierarchy.joint_bodies], dtype=np.str_)
-    return Skeleton(
-        joint_positions,
-        hierarchy.joint_bodies,
-        joint_names,
-        names,
-        rotations,
-        centers,
-        hierarchy.root,
-        centers[:, hierarchy.root],
-        offsets,
-        middle - anchors,
-        local_rotations(rotations, hierarchy),
-        True,
-        float(fps),
-    )

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pydantic import Field
 
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.model.motion_paths import DEPTH_FRACTION, MotionPaths, sure_part, within_ray
-from geomocap.settings import Settings
+from geomocap.model.skeleton import bone_fixed_skeleton
 from geomocap.skeleton.articulated_adjustment import JointPrior, adjust
 from geomocap.skeleton.body_observations import Observations, SkinPoints
-from geomocap.skeleton.bone_motion import fit_offsets, forward_kinematics, local_rotations
+from geomocap.skeleton.bone_motion import fit_offsets, forward_kinematics
 from geomocap.skeleton.borders import Border
 from geomocap.skeleton.hinges import find_hinges, turn_information
 from geomocap.skeleton.kinematics import (
@@ -24,47 +23,13 @@ from geomocap.skeleton.kinematics import (
     posed,
     since,
 )
-from geomocap.skeleton.motion_skeleton import MotionSkeleton, skeleton_of_motion
+from geomocap.skeleton.motion_skeleton import MotionSkeleton
+from geomocap.skeleton.motion_skeleton_settings import RefinementSettings
 from geomocap.skeleton.motion_smoothness import Smoothness, typical_accelerations
 from geomocap.skeleton.skinning import candidates_near, fit_fractions
 
 _MEDIAN_LENGTH = 1.54  # median length of a normal vector of three dimensions, standard deviations
 _SETTLE_ROUNDS = 3
-
-
-class RefinementSettings(Settings):
-    """How the motion of connected bodies is refined over all frames."""
-
-    rounds: int = Field(
-        default=3, ge=0, description="rounds of skin weights, shape, and motion with joints; 0: no refinement"
-    )
-    steps: int = Field(default=4, ge=1, description="steps of each adjustment of motion and joints")
-    independence: float = Field(
-        default=0.3, gt=0, le=1, description="fraction of the observations that err independently of each other (0..1)"
-    )
-    noise: float = Field(
-        default=2e-4, gt=0, description="least standard deviation of how a sample follows its bodies (diagonals)"
-    )
-    joint_sigma: float = Field(
-        default=2e-3,
-        gt=0,
-        description="standard deviation of the joints found before, against all observations (diagonals)",
-    )
-    least_slip: float = Field(
-        default=3e-4, gt=0, description="least standard deviation of how far a joint's bodies part (diagonals)"
-    )
-    blend_sigma: float = Field(
-        default=1e-3, gt=0, description="misfit that is worth a change of the skin weights by one (diagonals)"
-    )
-    least_turn_deg: float = Field(
-        default=0.3, gt=0, description="least scale of the turning accelerations (degrees/frame²)"
-    )
-    least_shift: float = Field(
-        default=5e-4, gt=0, description="least scale of the root's accelerations (diagonals/frame²)"
-    )
-    cutoff: float = Field(
-        default=3.0, gt=0, description="residuals and accelerations beyond count less (standard deviations)"
-    )
 
 
 @dataclass(frozen=True)
@@ -138,9 +103,9 @@ def refine_skeleton(
     # Bones that keep their length, their joints as near as can be to where bodies meet
     places = refined.joint_positions()
     offsets, _ = fit_offsets(linkage.hierarchy, bodies.rotations, centers[:, root], places, centers)
-    local = local_rotations(bodies.rotations, linkage.hierarchy)
+    local = linkage.hierarchy.local_rotations(bodies.rotations)
     places, _ = forward_kinematics(linkage.hierarchy, offsets, local, centers[:, root])
-    skeleton = skeleton_of_motion(
+    skeleton = bone_fixed_skeleton(
         linkage.hierarchy, places[0], bodies.rotations, places, centers, middle, found.skeleton.fps
     )
     joints = tuple(

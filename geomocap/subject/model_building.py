@@ -44,7 +44,6 @@ class BodyCloud:
 def build_model(
     found: MotionSkeleton,
     bodies: MotionBodies,
-    hinge: np.ndarray,
     read: Callable[[int], BodyCloud],
     spacing: float,
     up: int = 2,
@@ -59,8 +58,6 @@ def build_model(
     found : MotionSkeleton
     bodies : MotionBodies
         Samples with skin weights.
-    hinge : (J,) bool
-        Joints that turn about their axis only.
     read : callable
         `read(frame) -> BodyCloud`.
     spacing : float, metres
@@ -90,7 +87,7 @@ def build_model(
         skeleton.joint_positions[0],
         skeleton.joint_bodies,
         np.array([joint.axis for joint in found.joints]).reshape(-1, 3),
-        hinge,
+        np.array([joint.hinge for joint in found.joints], dtype=bool),
         rotation_limits(skeleton.local_rotations[:, skeleton.joint_bodies[:, 1]]),
         skeleton.joint_names,
         skeleton.body_names,

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geomocap.errors import GeometryError
+from geomocap.errors import GeometryError, RunError
+from geomocap.files.npz import read_npz, write_npz
 from geomocap.model.hierarchy import Hierarchy
 from geomocap.skeleton.body_observations import SkinPoints
 from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, body_motion, posed
@@ -17,6 +18,7 @@ from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, body_
 MODEL_FILE = "model.npz"
 KIND = "geomocap subject model"
 VERSION = 1
+_BEFORE = {"skin_shares": "skin_weights", "extent": "diagonal"}  # arrays as older versions call them
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class SubjectModel:
     colors : (P, 3) uint8 or (0, 3)
         RGB; none if the geometry had no colours.
     skin_bodies, skin_weights : (P, 4) int32, (P, 4) float
-        Bodies that each point follows, the main one first, and by which shares; they sum to one.
+        Bodies that each point follows, the main one first, and by which weights; they sum to one.
     joints : (J, 3) float, metres, world
         At rest.
     joint_bodies : (J, 2) int32
@@ -169,16 +171,17 @@ class SubjectModel:
         limits = np.minimum(low, self.joint_limits[:, 0]), np.maximum(high, self.joint_limits[:, 1])
         return replace(self, joint_limits=np.stack(limits, axis=1))
 
-    def arrays(self) -> dict[str, Any]:
-        """Return the arrays of `model.npz`."""
-        values = {name: np.asarray(getattr(self, name)) for name in self.__dataclass_fields__}
-        return {"kind": np.array(KIND), "version": np.array(VERSION), **values}
-
 
 def rotation_limits(rotations: np.ndarray) -> np.ndarray:
     """Least and largest components of rotation vectors, (J, 2, 3) radians, of rotations (T, J, 3, 3)."""
     vectors = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec().reshape(*rotations.shape[:2], 3)
     return np.stack([vectors.min(axis=0), vectors.max(axis=0)], axis=1)
+
+
+def write_model(path: Path, model: SubjectModel) -> None:
+    """Write a `model.npz`, whole or not at all."""
+    values = {f.name: np.asarray(getattr(model, f.name)) for f in fields(model)}
+    write_npz(path, {"kind": np.array(KIND), "version": np.array(VERSION), **values})
 
 
 def read_model(path: Path) -> SubjectModel:
@@ -189,18 +192,17 @@ def read_model(path: Path) -> SubjectModel:
     GeometryError
         If the file is missing, damaged, no model, or inconsistent.
     """
+    if not path.is_file():
+        raise GeometryError(f"{path}: no such model; a run by motion writes its subject's as model.npz")
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
-            arrays = dict(data)
-    except FileNotFoundError:
-        raise GeometryError(f"{path}: no such model; a run by motion writes its subject's as model.npz") from None
-    except Exception as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise GeometryError(f"{path}: can't be read as a model ({reason}); expected a run's model.npz") from None
+        arrays = read_npz(path)
+    except RunError:
+        raise GeometryError(f"{path}: can't be read as a model; expected a run's model.npz") from None
     if str(arrays.get("kind", "")) != KIND:
         raise GeometryError(f"{path}: no subject model; expected a run's model.npz")
     if arrays.get("version") != VERSION:
         raise GeometryError(f"{path}: model of version {arrays.get('version')}, expected {VERSION}; make it anew")
+    arrays |= {now: arrays[before] for before, now in _BEFORE.items() if before in arrays}
     names = list(SubjectModel.__dataclass_fields__)
     missing = [name for name in names if name not in arrays]
     if missing:

@@ -11,36 +11,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pydantic import Field
 from scipy.spatial import cKDTree
 
-from geomocap.model.trajectories import REASONS, TOO_FAST, TOO_JERKY, TOO_SHORT, UNLIKE, Trajectories
-from geomocap.settings import Settings
-from geomocap.trajectories.smoothing import PathDerivatives
+from geomocap.model.trajectories import REASONS, TOO_FAST, TOO_JERKY, TOO_SHORT, UNLIKE, PathDerivatives, Trajectories
+from geomocap.trajectories.trajectory_settings import FilterSettings
 
 _MOVING = 0.995  # fraction of all points whose speed and acceleration are certainly true
 _UNIFORM = 0.95  # fraction that certainly moves like the surface around it
 _LEAST_UNLIKE = 1e-6  # m; rounding isn't motion
 _NEIGHBOURS = 8
 _AGREEING = 3
-
-
-class FilterSettings(Settings):
-    """Which trajectories are cut or removed."""
-
-    on: bool = Field(True, description="Cut and remove trajectories that can't be true")
-    fastest: float | None = Field(None, gt=0, description="Highest speed (m/s); from the data if not given")
-    acceleration: float | None = Field(
-        None, gt=0, description="Highest acceleration (m/s²); from the data if not given"
-    )
-    beyond_data: float = Field(
-        2.5, gt=1, description="Limits from the data: so many times what all but a few points don't exceed"
-    )
-    window: int = Field(4, ge=1, description="Frames over which the motion is compared with that around it")
-    unlike: float | None = Field(
-        None, gt=0, description="Largest distance from where the motion around it leads (m); from the data if not given"
-    )
-    least_frames: int = Field(3, ge=1, description="Frames that a trajectory needs")
 
 
 @dataclass(frozen=True)

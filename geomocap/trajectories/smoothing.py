@@ -11,40 +11,13 @@ a millimetre, its velocities were wrong by 0.045 m/s RMS, the cubic's by 0.026 (
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from pydantic import Field
 
 from geomocap.errors import GeometryError
-from geomocap.settings import Settings
+from geomocap.model.trajectories import PathDerivatives
+from geomocap.trajectories.trajectory_settings import SmoothingSettings
 
 _REGULAR = 1e-9
-
-
-class SmoothingSettings(Settings):
-    """How velocities and accelerations are estimated."""
-
-    half_width: int = Field(3, ge=1, description="Frames on each side that a velocity is estimated from")
-    degree: int = Field(3, ge=1, le=4, description="Degree of the polynomial in time")
-
-
-@dataclass(frozen=True)
-class PathDerivatives:
-    """Smoothed motion of N points over T frames; NaN where too few frames are near.
-
-    Attributes
-    ----------
-    velocities : (N, T, 3) float, m/s
-    accelerations : (N, T, 3) float, m/s²
-    velocity_std, acceleration_std : (N, T) float
-        Standard deviation of each coordinate that the measurement's noise leaves.
-    """
-
-    velocities: np.ndarray
-    accelerations: np.ndarray
-    velocity_std: np.ndarray
-    acceleration_std: np.ndarray
 
 
 def smooth_motion(

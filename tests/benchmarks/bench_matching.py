@@ -19,8 +19,10 @@ from geomocap.carving.carving_settings import CarvingSettings
 from geomocap.carving.frames import carve_frame
 from geomocap.carving.silhouette_views import Undistortion
 from geomocap.carving.volume import working_volume
-from geomocap.dense import CloudFrame, cloud_of_frame, match_groups
+from geomocap.dense.dense_frame import CloudFrame, cloud_of_frame
+from geomocap.dense.match_groups import match_groups
 from geomocap.files.images import read_image
+from geomocap.files.rigs import read_rig
 from geomocap.matching.lsm import match_pairs
 from geomocap.matching.matching_settings import KernelSettings
 from geomocap.matching.spline import SplineImage
@@ -150,7 +152,7 @@ def shot(**scene: float) -> Shot | None:
     with tempfile.TemporaryDirectory() as scratch:
         capture, truth = Path(scratch) / "capture", Path(scratch) / "truth"
         synthesize(load_gltf(asset), capture, truth, SynthesisSettings.model_validate({"frames": 1, **scene}))
-        rig = Rig.read(capture / "sparse")
+        rig = read_rig(capture / "sparse")
         images = [read_image(capture / "images" / n / "000000.png") for n in rig.names]
         masks = [read_image(truth / "masks" / n / "000000.png", gray=True) for n in rig.names]
         with np.load(truth / "truth.npz") as content:

@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from geomocap.model.ellipsoids import fit_ellipsoids
-from geomocap.model.rotations import body_rotations
 from geomocap.segmentation.axis_joints import grow_joints
+from geomocap.segmentation.body_rotations import body_rotations
 from geomocap.segmentation.contacts import count_contacts
 from geomocap.segmentation.ellipsoid_matching import match_frames
 from geomocap.segmentation.ellipsoid_merging import merge_frame, merge_leaves

@@ -5,7 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from geomocap.silhouettes import SilhouetteSettings, model_from_plate, silhouette
+from geomocap.silhouettes.background import model_from_plate
+from geomocap.silhouettes.extraction import silhouette
+from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 from tests.benchmarks.table import Row, measure
 from tests.geomocap.test_silhouettes import overlap, scene
 

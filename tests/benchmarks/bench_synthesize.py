@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.camera_views import PixelRays
+from data_tools.camera_views import DistortedView
 from data_tools.figure import figure
 from data_tools.image_rendering import PosedSubject, expose, render_subject
 from data_tools.shading import ShadedSurface
@@ -26,7 +26,7 @@ def benchmark() -> list[Row]:
     vertices = np.array([asset.vertices(t) for t in np.arange(FRAMES) / settings.fps])
     world = make_world(vertices, settings)
     surface = ShadedSurface.of(asset, world.footprint, settings.texture_contrast, 0)
-    subject, view = PosedSubject.of(surface, vertices[0]), PixelRays.of(world.rig, 0)
+    subject, view = PosedSubject.of(surface, vertices[0]), DistortedView.of(world.rig, 0)
     everywhere = np.arange(settings.width * settings.height)
     light = np.full((settings.height, settings.width, 3), 100, np.float32)
 

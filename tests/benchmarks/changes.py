@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 
 from geomocap.files.capture import Capture
+from geomocap.files.rigs import write_rig
 from geomocap.files.scan_geometry import ScanSurface, places_on
 from geomocap.model.rig import Rig
 
@@ -68,7 +69,7 @@ def crop(capture: Path, truth: Path) -> None:
         camera = rig.cameras[c]
         camera.principal_point_y -= rows.start or 0
         camera.height, camera.width = image.shape[:2]
-    rig.write(capture / "sparse")
+    write_rig(capture / "sparse", rig)
 
 
 def perfect_tracks(truth: Path, scans: Path) -> None:
@@ -129,7 +130,7 @@ def different_cameras(capture: Path, truth: Path) -> None:
             cv2.imwrite(str(background), seen(background))
         else:
             background.unlink()
-    Rig(rig.names, tuple(cameras), rig.cam_from_world).write(capture / "sparse")
+    write_rig(capture / "sparse", Rig(rig.names, tuple(cameras), rig.cam_from_world))
 
 
 def _camera(old: pycolmap.Camera, model: str, size: tuple[int, int], distortion: list[float]) -> pycolmap.Camera:

@@ -75,3 +75,55 @@ def fan(duration: float = 2.0) -> AnimatedAsset:
              ((Y, 0, 170, 1, 0.9),)),
     ]  # fmt: skip
     return assemble("fan", parts, duration).standing()
+
+
+def doll(duration: float = 1.5, limb_bones: int = 1) -> AnimatedAsset:
+    """Make a doll with a soft trunk that bends, one skin over hips and chest: 7 bodies.
+
+    The skin follows both bones by parts that sum to 1, 12 cm to both sides of the waist. With `limb_bones` = 2 its
+    elbows and knees are soft too, 5 cm to both sides: 11 bodies. With 0 there are no limbs: 3 bodies.
+    """
+    cloth, skin = (0.5, 0.6, 0.7), (0.8, 0.65, 0.5)
+    parts = [
+        Part("hips", "", (0, 0, 0.86), (ellipsoid((0.17, 0.12, 0.4), (0, 0, 0.25), rings=31),), cloth,
+             ((Z, 0, 15, 1, 0.0),)),
+        Part("chest", "hips", (0, 0, 0.25), (), cloth, ((X, 10, 28, 1, 1.0), (Z, 0, 22, 1, 2.2))),
+        Part("head", "chest", (0, 0, 0.4), (ellipsoid((0.09, 0.11, 0.13), (0, 0, 0.13)),), skin,
+             ((Z, 0, 32, 1, 0.7), (X, 0, 15, 1, 2.9))),
+    ]  # fmt: skip
+    sides = (("left", 1.0, 0.0), ("right", -1.0, np.pi)) if limb_bones else ()
+    for side, sign, phase in sides:
+        arm, leg = f"{side}_arm", f"{side}_leg"
+        parts += [
+            Part(arm, "chest", (sign * 0.16, 0, 0.26), (ellipsoid((0.06, 0.06, 0.31), (0, 0, -0.27), rings=41),), skin,
+                 ((Y, -sign * 45, 18, 1, phase + 0.6), (X, 6, 40, 1, phase + 0.2))),
+            Part(leg, "hips", (sign * 0.1, 0, -0.02), (ellipsoid((0.085, 0.085, 0.44), (0, 0, -0.38), rings=41),),
+                 cloth, ((Y, -sign * 9, 6, 1, phase), (X, -16, 34, 1, phase + np.pi))),
+        ]  # fmt: skip
+        if limb_bones == 2:
+            parts += [
+                Part(f"{side}_forearm", arm, (0, 0, -0.28), (), skin, ((X, -50, 40, 1, phase + 1.1),)),
+                Part(f"{side}_shank", leg, (0, 0, -0.4), (), cloth, ((X, 42, 34, 1, phase + 2.0),)),
+            ]
+    soft = {part.name: 0.12 if part.name == "chest" else 0.05 for part in parts if not part.solids}
+    return _softened(assemble("doll", parts, duration), parts, soft).standing()
+
+
+def _softened(asset: AnimatedAsset, parts: list[Part], soft: dict[str, float]) -> AnimatedAsset:
+    """Share the skin of a parent with the bones along its z, over so many metres to both sides of their joints."""
+    index = {part.name: k for k, part in enumerate(parts)}
+    place = np.zeros((len(parts), 3))
+    for k, part in enumerate(parts):
+        place[k] = np.array(part.offset) + (place[index[part.parent]] if part.parent else 0.0)
+    weights, owner = asset.slot_weights.copy(), asset.slot_weights.argmax(axis=1)
+    for name, half in soft.items():
+        child = index[name]
+        parent, joint = index[parts[child].parent], parts[child].offset[2]
+        own = owner == parent
+        beyond = (asset.bind_vertices[own, 2] - joint) * np.sign(joint)
+        weights[own, child] = np.clip(beyond / (2 * half) + 0.5, 0.0, 1.0)
+        weights[own, parent] = 1.0 - weights[own, child]
+    from_bind = asset.slot_from_bind.copy()
+    from_bind[:, :3, 3] = -place
+    bound = asset.bind_vertices + place[owner]
+    return replace(asset, bind_vertices=bound, slot_weights=weights, slot_from_bind=from_bind)

@@ -1,12 +1,14 @@
-"""How good whole runs are: the table of the README, made anew.
+"""How good whole runs are: the first table of the page of results, made anew.
 
 `python -m tests.benchmarks.quality FOLDER [NAME …]` synthesizes each capture into FOLDER, runs it with the defaults,
 compares it with its truth and prints one row each. What is there already is taken, so that it may be stopped and
-shared between processes. Captures of characters that are files need the folder of data in `GEOMOCAP_DATA`.
+shared between processes; each figure keeps the commit that it was measured with. `--results FILE.toml` puts the rows
+into a table of `docs/results`. Captures of characters that are files need the folder of data in `GEOMOCAP_DATA`.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shutil
@@ -14,7 +16,9 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import date
 from pathlib import Path
+from typing import Any
 
 from data_tools.asset import AnimatedAsset
 from data_tools.figure import figure, mechanism
@@ -22,8 +26,10 @@ from data_tools.gltf_reader import load_gltf
 from data_tools.synthesize import SynthesisSettings, synthesize
 from tests.benchmarks.changes import crop, different_cameras, fresh_samples, give_silhouettes, perfect_tracks, reverse
 from tests.benchmarks.creatures import fan, runner, snake, spider
+from tools.result_tables import ROOT, measured_now, read_table
 
 DATA = Path(os.environ.get("GEOMOCAP_DATA", "."))
+TABLE = ROOT / "docs" / "results" / "whole-runs.toml"
 
 
 def man() -> AnimatedAsset:
@@ -102,11 +108,13 @@ def folder_name(name: str) -> str:
     return "".join(c if c.isalnum() else "_" for c in name)
 
 
-def measure(name: str, root: Path) -> dict[str, float]:
-    """Make a capture, run it and compare it with its truth, unless that was done before."""
+def measure(name: str, root: Path) -> dict[str, Any]:
+    """Make a capture, run it and compare it with its truth, unless that was done before: the row of the results."""
     case, folder = CASES[name], root / folder_name(name)
-    figures = folder / "figures.json"
-    if not figures.exists():
+    figures, origin = folder / "figures.json", folder / "origin.json"
+    if not (figures.exists() and origin.exists()):
+        seed = int(case.flags[case.flags.index("--tracking.seed") + 1]) if "--tracking.seed" in case.flags else 0
+        began = measured_now(f'python -m tests.benchmarks.quality FOLDER "{name}"', seed)
         capture, truth, run = folder / "capture", folder / "truth", folder / "run"
         if case.change is not None or not (capture / "capture.toml").exists():
             shutil.rmtree(folder, ignore_errors=True)
@@ -120,23 +128,28 @@ def measure(name: str, root: Path) -> dict[str, float]:
             fps = str(SynthesisSettings(**case.synthesis).fps)
             _call("segment", folder / "scans.npz", run, "--fps", fps, "--no-pictures", *case.flags)
         _call("evaluate", run, truth, "--json", figures)
-    return json.loads(figures.read_text())
+        origin.write_text(json.dumps(began, default=str))
+    came = json.loads(origin.read_text())
+    return row(name, json.loads(figures.read_text())) | came | {"date": date.fromisoformat(came["date"])}
 
 
-def row(name: str, figures: dict[str, float]) -> str:
-    """Write the figures as a row of the README's table."""
-    edges = round(figures["skeleton.true_edges_found"] * (figures["truth.bodies"] - 1))
-    cells = (
-        name,
-        f"{figures['bodies.found']:.0f} / {figures['truth.bodies']:.0f}",
-        f"{figures['bodies.adjusted_rand_index']:.2f}",
-        f"{figures['bodies.core_adjusted_rand_index']:.2f}",
-        f"{figures['joints.recall_at_5%h']:.2f} / {figures['joints.precision_at_10%h']:.2f}",
-        f"{figures['joints.mean_error']:.0f}",
-        f"{edges} / {figures['truth.bodies'] - 1:.0f}, {figures['skeleton.false_edges']:.0f}",
-        f"{figures['motion.body_rotation_error_deg']:.1f}",
-    )
-    return "| " + " | ".join(cells) + " |"
+def row(name: str, figures: dict[str, float]) -> dict[str, Any]:
+    """Return the figures of an evaluation as the tables of results name them."""
+    connections = int(figures["truth.bodies"]) - 1
+    return {
+        "name": name,
+        "bodies_found": int(figures["bodies.found"]),
+        "bodies_true": int(figures["truth.bodies"]),
+        "ari": figures["bodies.adjusted_rand_index"],
+        "core_ari": figures["bodies.core_adjusted_rand_index"],
+        "joint_recall": figures["joints.recall_at_5%h"],
+        "joint_precision": figures["joints.precision_at_10%h"],
+        "joint_error_mm": figures["joints.mean_error"],
+        "edges_found": round(figures["skeleton.true_edges_found"] * connections),
+        "edges_true": connections,
+        "edges_false": int(figures["skeleton.false_edges"]),
+        "rotation_error_deg": figures["motion.body_rotation_error_deg"],
+    }
 
 
 def _call(command: str, *arguments: Path | str) -> None:
@@ -144,18 +157,20 @@ def _call(command: str, *arguments: Path | str) -> None:
     subprocess.run(line, check=True, stdout=subprocess.DEVNULL)
 
 
-HEAD = (
-    "| capture | bodies found / true | ARI | core ARI | joints recall 5 % / precision | error (mm) | edges, false "
-    "| rotation (°) |\n|---|---|---|---|---|---|---|---|"
-)
-
-
 def main() -> None:
-    if len(sys.argv) < 2:
-        sys.exit(__doc__)
-    print(HEAD)
-    for name in sys.argv[2:] or CASES:
-        print(row(name, measure(name, Path(sys.argv[1]))), flush=True)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("names", nargs="*", metavar="NAME")
+    parser.add_argument("--results", type=Path, help="table of results that takes the rows, docs/results/….toml")
+    arguments = parser.parse_args()
+    layout = read_table(arguments.results or TABLE)
+    columns = layout.values["columns"]
+    print("| " + " | ".join(column["label"] for column in columns) + " |\n" + "|---" * len(columns) + "|")
+    for name in arguments.names or CASES:
+        measured = measure(name, arguments.folder)
+        print("| " + " | ".join(layout.cells(measured, columns)) + " |", flush=True)
+        if arguments.results is not None:
+            read_table(arguments.results).with_rows([measured]).write()
 
 
 if __name__ == "__main__":

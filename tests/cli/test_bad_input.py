@@ -10,6 +10,7 @@ import pycolmap
 import pytest
 
 from geomocap.files.capture import Capture
+from geomocap.files.rigs import read_rig, write_rig
 from geomocap.model.rig import Rig
 from tests.cli.conftest import SETTINGS, last_line
 
@@ -85,11 +86,11 @@ def test_missing_given_mask(capture, small_capture, geomocap, tmp_path):
 
 
 def test_camera_looking_away(capture, geomocap, tmp_path):
-    rig = Rig.read(capture / "sparse")
+    rig = read_rig(capture / "sparse")
     poses = np.array(rig.cam_from_world)
     poses[1] = np.diag([1.0, -1.0, -1.0]) @ poses[1]  # turned by 180° about its x axis
     shutil.rmtree(capture / "sparse")
-    Rig(rig.names, rig.cameras, poses).write(capture / "sparse")
+    write_rig(capture / "sparse", Rig(rig.names, rig.cameras, poses))
     said = refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
     assert f"camera {rig.names[1]} contradict the others" in said
 
@@ -114,9 +115,9 @@ def test_damaged_calibration(capture, geomocap, tmp_path):
 
 
 def test_calibration_that_lacks_a_camera(capture, geomocap, tmp_path):
-    rig = Rig.read(capture / "sparse")
+    rig = read_rig(capture / "sparse")
     shutil.rmtree(capture / "sparse")
-    rig.select(rig.names[:-1]).write(capture / "sparse")
+    write_rig(capture / "sparse", rig.select(rig.names[:-1]))
     said = refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
     assert f"no posed image of camera {rig.names[-1]}" in said
 

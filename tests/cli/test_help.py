@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 
 import pytest
-import typer
 
+from geomocap.cli import app as commands
 from geomocap.cli.app import app
 
-COMMANDS = typer.main.get_command(app).commands
+COMMANDS = {name: commands.load(name) for name in commands.COMMANDS}
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -41,4 +43,28 @@ def test_each_command_takes_a_settings_file_and_a_number_of_workers(name):
 
 @pytest.mark.parametrize("name", ["run", "segment"])
 def test_the_number_of_bodies_has_a_short_flag(name):
-    assert ["--motion_bodies.bodies", "--bodies"] in [p.opts for p in COMMANDS[name].params]
+    assert ["--bodies"] in [p.opts for p in COMMANDS[name].params]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_list_of_commands_says_what_their_own_help_says(name):
+    first = COMMANDS[name].help.split("\n\n")[0]
+    assert " ".join(first.split()) == commands.COMMANDS[name][1]
+
+
+def test_help_of_the_main_job_shows_about_forty_flags():
+    shown = [p for p in COMMANDS["run"].params if p.param_type_name == "option"]
+    assert 30 <= len(shown) <= 45
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["run", "--help"]])
+def test_help_loads_nothing_that_computes(arguments):
+    code = (
+        "import sys, geomocap.cli\n"
+        f"sys.argv = ['geomocap', *{arguments}]\n"
+        "try:\n    geomocap.cli.main()\n"
+        "except SystemExit:\n    pass\n"
+        "print(*[m for m in ('numpy', 'numba', 'scipy', 'open3d', 'cv2', 'matplotlib') if m in sys.modules], 'end')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "end"

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from data_tools.calibration_files import read_calibration
-from geomocap.model.frame_geometry import BodyPoints, Voxels
+from geomocap.files.frame_files import read_points, read_voxels
 from tests.cli.conftest import CAMERAS, FRAMES, SETTINGS
 
 CHANGING = {"timings.json", "run.toml"}
@@ -41,8 +41,8 @@ def finished(small_capture, geomocap, tmp_path_factory) -> Path:
 def test_a_run_holds_what_the_contract_says(finished):
     assert len(list(finished.glob("silhouettes/*/*.png"))) == CAMERAS * FRAMES
     for k in range(FRAMES):
-        voxels = Voxels.read(finished / f"voxels/{k:06d}.ply")
-        bodies = BodyPoints.read(finished / f"bodies/{k:06d}.ply")
+        voxels = read_voxels(finished / f"voxels/{k:06d}.ply")
+        bodies = read_points(finished / f"bodies/{k:06d}.ply")
         assert len(voxels.indices) == len(bodies.positions) > 500
         np.testing.assert_allclose(bodies.positions, voxels.points, atol=1e-6)
         assert len(np.unique(voxels.colors, axis=0)) > 10
@@ -130,7 +130,7 @@ def test_scans_without_colours_or_cameras_get_bodies_by_motion(finished, geomoca
     geomocap("segment", finished / "voxels", tmp_path / "run", "--fps", 10, "--no-pictures")
     skeleton = np.load(tmp_path / "run/skeleton.npz")
     assert len(skeleton["joint_names"]) >= 2
-    labels = BodyPoints.read(tmp_path / "run/bodies/000003.ply").body
+    labels = read_points(tmp_path / "run/bodies/000003.ply").body
     assert len(np.unique(labels)) == skeleton["body_rotations"].shape[1]
 
 

@@ -13,6 +13,7 @@ from data_tools.image_sizes import find_fit, has_black_bars, possible_fits, refi
 from data_tools.importing import import_colmap, import_pose2sim
 from data_tools.video_writing import VideoFile
 from geomocap.errors import CalibrationError, CaptureError
+from geomocap.files.rigs import write_rig
 from geomocap.model.rig import Rig
 
 CALIBRATED, PLAYED = (272, 480), (256, 480)
@@ -174,13 +175,13 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match="no calibration"):
         import_pose2sim(source, tmp_path / "c")
     with pytest.raises(CaptureError, match="no images"):
-        rig_of(CALIBRATED).write(tmp_path / "model" / "sparse")
+        write_rig(tmp_path / "model" / "sparse", rig_of(CALIBRATED))
         import_colmap(tmp_path / "model", tmp_path / "c2", 30)
 
 
 def test_colmap_project_becomes_a_capture(tmp_path: Path) -> None:
     rig = rig_of((32, 24))
-    rig.write(tmp_path / "project" / "sparse" / "0")
+    write_rig(tmp_path / "project" / "sparse" / "0", rig)
     random = np.random.default_rng(0)
     for name in rig.names:
         folder = tmp_path / "project" / "images" / name

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from data_tools.bar import BarRecording, picture_bar
-from data_tools.camera_views import PixelRays, look_at
+from data_tools.camera_views import DistortedView, look_at
 from data_tools.figure import figure
 from data_tools.image_rendering import PosedSubject, render_subject
 from data_tools.placement import make_camera
@@ -18,6 +18,7 @@ from data_tools.solid_noise import fabric_noise, gradient_noise
 from data_tools.synthesize import SynthesisResult, SynthesisSettings, make_world, synthesize
 from geomocap.errors import CaptureError
 from geomocap.files.capture import Capture
+from geomocap.files.rigs import read_rig
 from geomocap.model.ray_casting import touched_pixels
 from geomocap.model.rig import Rig
 from geomocap.scheduling import threads
@@ -48,7 +49,7 @@ def digest(folder: Path) -> dict[str, str]:
 def test_rays_of_a_pixel_are_centred_on_it() -> None:
     camera = make_camera(320, 240, 60, 2.0, np.random.default_rng(0))
     rig = Rig(("a",), (camera,), look_at(np.array([3.0, 1, 2]), np.zeros(3))[None])
-    view = PixelRays.of(rig, 0)
+    view = DistortedView.of(rig, 0)
     pixels = np.array([0, 319, 120 * 320 + 160, 239 * 320])
     for samples in (1, 2, 4):
         rays = view.rays(pixels, samples).astype(np.float64)
@@ -67,7 +68,7 @@ def test_touched_pixels_hold_all_that_is_hit() -> None:
     surface = ShadedSurface.of(figure(), world.footprint, 0.28, 0)
     subject = PosedSubject.of(surface, vertices)
     for c in range(len(world.rig)):
-        view = PixelRays.of(world.rig, c)
+        view = DistortedView.of(world.rig, c)
         everything = np.arange(160 * 120)
         rays = view.rays(everything, 4).reshape(-1, 6)
         hit = np.isfinite(subject.scene.cast(rays)[0]).reshape(-1, 16)
@@ -129,7 +130,7 @@ def test_capture_opens_and_knows_its_cameras(made) -> None:
     assert (capture.n_frames, capture.fps, capture.info.up) == (3, 10, "z")
     assert capture.cameras == ("cam01", "cam02", "cam03")
     np.testing.assert_allclose(capture.rig.cam_from_world, result.rig.cam_from_world, atol=1e-12)
-    np.testing.assert_allclose(Rig.read(truth / "sparse").cam_from_world, result.rig.cam_from_world, atol=1e-12)
+    np.testing.assert_allclose(read_rig(truth / "sparse").cam_from_world, result.rig.cam_from_world, atol=1e-12)
     assert all(c.model.name == "OPENCV" for c in capture.rig.cameras)
     assert len({tuple(c.params) for c in capture.rig.cameras}) == 3  # each lens its own
     assert all(capture.has_background(c) for c in capture.cameras)
@@ -222,7 +223,7 @@ def test_centroids_of_targets_are_their_centres(size: tuple[int, int], monkeypat
     dark = np.zeros((size[1], size[0], 3), np.float32)
     errors = []
     for c in range(len(world.rig)):
-        view = PixelRays.of(world.rig, c)
+        view = DistortedView.of(world.rig, c)
         for pair in bar.targets:
             image = picture_bar(dark, view, world.rig, c, pair, bar.radius)[:, :, 0]
             both = world.rig.project(pair)[c]
@@ -294,7 +295,7 @@ def test_video_and_withheld_calibration(tmp_path: Path, made) -> None:
     synthesize(figure(), tmp_path / "c", tmp_path / "t", settings)
     filmed = Capture.open(tmp_path / "c")
     assert (filmed.n_frames, filmed.is_calibrated) == (3, False)
-    assert Rig.read(tmp_path / "t" / "sparse").names == capture.cameras
+    assert read_rig(tmp_path / "t" / "sparse").names == capture.cameras
     for t in (2, 0):
         off = filmed.frame("cam02", t).astype(int) - capture.frame("cam02", t)
         assert np.abs(off).mean() < 4  # lossy, and colours at half the resolution

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 
-from geomocap.export.file_rotations import rotation_about
 from geomocap.files.run import Run
+from geomocap.model.rotations import rotation_about
 
 PARENTS = np.array([-1, 0, 1, 0, 3])
 LENGTH, WIDTH = 0.4, 0.05
@@ -85,10 +85,10 @@ def flawed_run(folder: Path, *, joint_noise: float = 0.02, seed: int = 1) -> Run
     run.write_npz(
         "skeleton.npz",
         joint_positions=joints,
-        joint_bodies=np.array([[0, 1], [1, 2], [0, 3], [2, 3]]),
+        joint_bodies=np.array([[0, 1], [1, 2], [0, 3], [2, 4]]),
         joint_names=np.array(["joint_body00_body01", "joint_body01_body02", "joint_body00_body03", "joint_odd"]),
-        body_rotations=turned,
-        body_positions=t["joint_positions"][:, first],
+        body_rotations=turned[:, [0, 1, 2, 3, 3]],  # the last one is a body without points
+        body_positions=t["joint_positions"][:, [0, 1, 2, 3, 3]],
         fps=15.0,
     )
     for k in range(T):

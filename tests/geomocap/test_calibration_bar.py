@@ -18,6 +18,7 @@ from geomocap.calibration.from_capture import calibrate_capture
 from geomocap.calibration.initial import pair_all
 from geomocap.calibration.recording import Recording, measure
 from geomocap.errors import CalibrationError, CaptureError
+from geomocap.files.rigs import read_rig
 from geomocap.model.rig import Rig
 from tests.geomocap.bar_scenes import (
     Scene,
@@ -91,7 +92,7 @@ def test_from_images_alone(make: Callable[[int, int], Scene], seed: int, n_bars:
     assert model.compute_mean_reprojection_error() < 0.02
     tracks = sum(p.track.length() for p in model.points3D.values())
     assert tracks == len(calibration.adjusted.network.bar)
-    read = Rig.read(tmp_path / "sparse", scene.rig.names)
+    read = read_rig(tmp_path / "sparse", scene.rig.names)
     np.testing.assert_allclose(read.centers, calibration.rig.centers, atol=1e-9)
     calibration.write(tmp_path / "sparse")  # our own may be replaced
     (tmp_path / "sparse" / "calibration.json").unlink()

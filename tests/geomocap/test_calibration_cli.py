@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from geomocap.cli.calibrate_command import calibrate
 from geomocap.errors import GeomocapError
-from geomocap.model.rig import Rig
+from geomocap.files.rigs import read_rig, write_rig
 from tests.geomocap.bar_scenes import three_cameras
 
 app = typer.Typer()
@@ -27,7 +27,7 @@ def run(*arguments: str | Path) -> str:
 @pytest.fixture
 def points(tmp_path: Path) -> Path:
     scene = three_cameras(1, 40)
-    scene.rig.write(tmp_path / "true")
+    write_rig(tmp_path / "true", scene.rig)
     pixels = scene.points(np.random.default_rng(0), 0.05)
     lines = ["frame,camera,point,x,y,sigma"]
     for c, t, e in np.ndindex(*pixels.shape[:3]):
@@ -43,11 +43,11 @@ def test_points_to_model_and_report(points: Path, tmp_path: Path) -> None:
     common = (capture, "--points", points, "--distance", "0.5", "--align", tmp_path / "true")
     words = run(*common)
     assert "calibration of 3 cameras" in words and "report.html" in words
-    true, ours = Rig.read(tmp_path / "true"), Rig.read(capture / "sparse")
+    true, ours = read_rig(tmp_path / "true"), read_rig(capture / "sparse")
     np.testing.assert_allclose(ours.centers, true.centers, atol=0.01)
     assert (capture / "calibration" / "report.html").stat().st_size > 50_000
     run(*common, "--no-report")  # our own calibration may be replaced
-    true.write(capture / "sparse")
+    write_rig(capture / "sparse", true)
     (capture / "sparse" / "calibration.json").unlink()
     with pytest.raises(GeomocapError, match="--force"):
         run(*common)

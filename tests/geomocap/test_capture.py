@@ -13,6 +13,7 @@ from PIL import Image
 
 from geomocap.errors import CaptureError
 from geomocap.files.capture import Capture, CaptureInfo, write_capture_info
+from geomocap.files.rigs import write_rig
 from geomocap.files.videos import Video
 from tests.geomocap.test_cameras import make_rig
 
@@ -32,7 +33,7 @@ def make_capture(path, cameras=3, frames=4):
         folder.mkdir(parents=True)
         for k in range(frames):
             cv2.imwrite(str(folder / f"{k:06d}.png"), picture(c, k)[..., ::-1])
-    make_rig().write(path / "sparse")
+    write_rig(path / "sparse", make_rig())
     return path
 
 

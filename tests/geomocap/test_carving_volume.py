@@ -215,7 +215,7 @@ def test_an_empty_silhouette_comes_with_advice_that_can_be_followed():
     with pytest.raises(GeometryError, match=r"camera cam1: its silhouettes are empty, or nearly so, in all 1 frames"):
         working_volume([views], allowed)
     views.masks[:3] = 0
-    with pytest.raises(GeometryError, match=r"out of sight, name the frames that show it in capture\.toml"):
+    with pytest.raises(GeometryError, match=r"out of view, name the frames that show it in capture\.toml"):
         check_silhouettes(views, 3, HullSettings())
 
 

@@ -6,12 +6,13 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from geomocap.evaluation import EvaluationSettings, evaluate
 from geomocap.evaluation.body_scores import adjusted_rand_index
+from geomocap.evaluation.evaluation_settings import EvaluationSettings
 from geomocap.evaluation.result import EvaluationError
-from geomocap.evaluation.surfaces import read_labelled
+from geomocap.evaluation.run_evaluation import evaluate
 from geomocap.evaluation.truth import Truth
 from geomocap.export.export_errors import MotionError
+from geomocap.files.results import read_points
 from geomocap.files.run import Run
 from tests.geomocap.made_truth import flawed_run, truth_arrays, write_truth
 
@@ -83,7 +84,7 @@ def test_cloud_against_distances_to_triangles(judged):
     run, t, result = judged
     accuracy, completeness, counts = [], [], []
     for k in range(0, 16, 3):
-        points = read_labelled(run, "cloud", k)[0]
+        points = read_points(run.frame_file("cloud", k)).positions
         accuracy.append(cKDTree(dense_surface(t, k)[0]).query(points)[0])
         completeness.append(np.linalg.norm(points[:, None] - t["vertices"][k], axis=-1).min(axis=0))
         counts.append(len(points))
@@ -101,7 +102,8 @@ def test_bodies_against_counting(judged):
     height = np.ptp(t["vertices"][0, :, 2])
     index = []
     for k in range(0, 16, 3):
-        points, label = read_labelled(run, "bodies", k)
+        read = read_points(run.frame_file("bodies", k))
+        points, label = read.positions, read.body
         surface, owner = dense_surface(t, k)
         distance, nearest = cKDTree(surface).query(points)
         true = np.array([0, 1, 2, 3, 3])[owner[nearest]]
@@ -153,7 +155,7 @@ def test_joints_against_loops(judged):
 def test_edges_and_rotations(judged):
     _, _, result = judged
     assert result.figures["skeleton.true_edges_found"] == 1
-    assert result.figures["skeleton.false_edges"] == 1  # 2–3
+    assert result.figures["skeleton.false_edges"] == 1  # 2–4
     # One body of three drifts evenly from 0° to 12°, the others are right.
     assert result.figures["motion.body_rotation_error_deg"] == pytest.approx(6 / 3, abs=1e-3)
 
@@ -182,6 +184,7 @@ def test_a_perfect_run_is_perfect(tmp_path):
     s["body_rotations"] = np.einsum("tbij,bkj->tbik", turned, turned[0])
     s["joint_positions"] = t["joint_positions"][:, [1, 2, 3]]
     s["joint_bodies"], s["joint_names"] = s["joint_bodies"][:3], s["joint_names"][:3]
+    s["body_positions"] = s["body_positions"][:, :4]
     run.write_npz("skeleton.npz", **s)
     f = evaluate(run.path, truth).figures
     assert f["joints.recall_at_5%h"] == f["joints.precision_at_10%h"] == f["skeleton.true_edges_found"] == 1
@@ -195,6 +198,7 @@ def test_one_body_recalls_no_joint(tmp_path):
     s = run.read_npz("skeleton.npz")
     s["joint_positions"], s["joint_bodies"] = s["joint_positions"][:, :0], s["joint_bodies"][:0]
     s["joint_names"], s["body_rotations"] = s["joint_names"][:0], s["body_rotations"][:, :1]
+    s["body_positions"] = s["body_positions"][:, :1]
     run.write_npz("skeleton.npz", **s)
     f = evaluate(run.path, truth).figures
     assert (f["joints.found"], f["joints.true"]) == (0, 3)
@@ -215,6 +219,7 @@ def test_a_perfect_run_of_two_roots_is_perfect(tmp_path):
     s = run.read_npz("skeleton.npz")
     s["joint_positions"], s["joint_bodies"] = t["joint_positions"][:, [1, 2]], np.array([[0, 1], [1, 2]])
     s["joint_names"] = s["joint_names"][:2]
+    s["body_rotations"], s["body_positions"] = s["body_rotations"][:, :3], s["body_positions"][:, :3]
     run.write_npz("skeleton.npz", **s)
     f = evaluate(run.path, truth).figures
     assert (f["truth.bodies"], f["joints.true"]) == (4, 2)

@@ -3,17 +3,18 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from geomocap.evaluation import EvaluationSettings, evaluate
+from geomocap.evaluation.evaluation_settings import EvaluationSettings
 from geomocap.evaluation.marker_track import MarkerTrack
 from geomocap.evaluation.other_system import compare_markers, match_by_distance, read_matches
 from geomocap.evaluation.result import EvaluationError
+from geomocap.evaluation.run_evaluation import evaluate
 from geomocap.export.bvh import write_bvh
 from geomocap.export.markers import Markers
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.trc import write_trc
 from geomocap.files.run import Run
 from geomocap.model.rotations import rigid_motion
-from tests.geomocap.articulated import skeleton_arrays
+from tests.geomocap.articulated import skeleton_arrays, skeleton_of
 
 OFFSET = 0.37
 BOTH = EvaluationSettings(align=True, find_offset=True)
@@ -108,7 +109,7 @@ def test_motion_files_as_truth(tmp_path, kind):
     if kind == "trc":
         write_trc(tmp_path / "truth.trc", Markers(tuple(arrays["joint_names"]), arrays["joint_positions"], 15.0))
     else:
-        write_bvh(tmp_path / "truth.bvh", motion_from_skeleton(arrays), unit="cm")
+        write_bvh(tmp_path / "truth.bvh", motion_from_skeleton(skeleton_of(arrays)), unit="cm")
     result = evaluate(run.path, tmp_path / f"truth.{kind}", unit="cm")
     assert result.figures["markers.matched"] == 6
     assert result.figures["markers.mean_error"] < 0.01

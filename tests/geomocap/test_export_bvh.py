@@ -7,9 +7,9 @@ from geomocap.export.bvh import read_bvh, write_bvh
 from geomocap.export.conventions import BVH, Convention
 from geomocap.export.export_errors import MotionError
 from geomocap.export.skeleton_motion import motion_from_skeleton
-from tests.geomocap.articulated import skeleton_arrays
+from tests.geomocap.articulated import articulated_skeleton, skeleton_arrays, skeleton_of
 
-KINDS = [{}, {"roots": 2}, {"jump_mm": 15.0}, {"wander_mm": 10.0}]
+KINDS = [{}, {"jump_mm": 15.0}, {"wander_mm": 10.0}]
 
 
 def joints_of(back, motion, convention=BVH):
@@ -26,7 +26,7 @@ def joints_of(back, motion, convention=BVH):
 @pytest.mark.parametrize("unit", ["m", "cm"])
 def test_read_back_by_ourselves(tmp_path, kind, unit):
     arrays = skeleton_arrays(**kind)
-    motion = motion_from_skeleton(arrays)
+    motion = motion_from_skeleton(skeleton_of(arrays))
     write_bvh(tmp_path / "m.bvh", motion, unit=unit)
     back = read_bvh(tmp_path / "m.bvh", unit=unit)
     np.testing.assert_allclose(joints_of(back, motion), arrays["joint_positions"], atol=1e-5)
@@ -37,7 +37,7 @@ def test_read_back_by_ourselves(tmp_path, kind, unit):
 def test_read_back_by_an_independent_reader(tmp_path, kind):
     bvhsdk = pytest.importorskip("bvhsdk")
     arrays = skeleton_arrays(**kind)
-    motion = motion_from_skeleton(arrays)
+    motion = motion_from_skeleton(skeleton_of(arrays))
     write_bvh(tmp_path / "m.bvh", motion)
     other = bvhsdk.ReadFile(str(tmp_path / "m.bvh"))
     assert other.frames == 20
@@ -51,7 +51,7 @@ def test_read_back_by_an_independent_reader(tmp_path, kind):
 
 
 def test_channels_are_stated_and_tabs_indent(tmp_path):
-    write_bvh(tmp_path / "m.bvh", motion_from_skeleton(skeleton_arrays()))
+    write_bvh(tmp_path / "m.bvh", motion_from_skeleton(articulated_skeleton()))
     text = (tmp_path / "m.bvh").read_text()
     assert "\tCHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation" in text
     assert "\n\t\tCHANNELS 3 Zrotation Xrotation Yrotation\n" in text
@@ -95,7 +95,7 @@ def test_centimetres_are_a_hundred_times_metres():
     ],
 )
 def test_broken_files(tmp_path, change, says):
-    write_bvh(tmp_path / "m.bvh", motion_from_skeleton(skeleton_arrays()))
+    write_bvh(tmp_path / "m.bvh", motion_from_skeleton(articulated_skeleton()))
     text = change((tmp_path / "m.bvh").read_text())
     (tmp_path / "m.bvh").write_text(text)
     with pytest.raises(MotionError, match=says) as caught:

@@ -5,7 +5,7 @@ from geomocap.export.c3d import read_c3d, write_c3d
 from geomocap.export.export_errors import MotionError
 from geomocap.export.markers import Markers, markers_from_run
 from geomocap.export.skeleton_motion import motion_from_skeleton
-from tests.geomocap.articulated import skeleton_arrays
+from tests.geomocap.articulated import articulated_skeleton, skeleton_arrays, skeleton_of
 
 ezc3d = pytest.importorskip("ezc3d")
 
@@ -20,8 +20,8 @@ def with_gap(markers):
 
 def test_points_read_back_by_ezc3d(tmp_path):
     arrays = skeleton_arrays()
-    markers = with_gap(markers_from_run(arrays))
-    write_c3d(tmp_path / "m.c3d", markers, motion_from_skeleton(arrays))
+    markers = with_gap(markers_from_run(skeleton_of(arrays)))
+    write_c3d(tmp_path / "m.c3d", markers, motion_from_skeleton(skeleton_of(arrays)))
     file = ezc3d.c3d(str(tmp_path / "m.c3d"))
     point = file["parameters"]["POINT"]
     assert point["LABELS"]["value"] == list(arrays["joint_names"])
@@ -38,8 +38,8 @@ def test_points_read_back_by_ezc3d(tmp_path):
 
 def test_rotations_of_bodies_read_back(tmp_path):
     arrays = skeleton_arrays()
-    motion = motion_from_skeleton(arrays)
-    write_c3d(tmp_path / "m.c3d", markers_from_run(arrays), motion)
+    motion = motion_from_skeleton(skeleton_of(arrays))
+    write_c3d(tmp_path / "m.c3d", markers_from_run(skeleton_of(arrays)), motion)
     file = ezc3d.c3d(str(tmp_path / "m.c3d"))
     assert file["parameters"]["ROTATION"]["LABELS"]["value"] == list(motion.names)
     assert file["parameters"]["ROTATION"]["RATE"]["value"][0] == 15
@@ -50,7 +50,7 @@ def test_rotations_of_bodies_read_back(tmp_path):
 
 @pytest.mark.parametrize("up", ["x", "y", "z"])
 def test_there_and_back(tmp_path, up):
-    markers = with_gap(markers_from_run(skeleton_arrays(), up=up))
+    markers = with_gap(markers_from_run(articulated_skeleton(), up=up))
     write_c3d(tmp_path / "m.c3d", markers)
     back = read_c3d(tmp_path / "m.c3d")
     assert back.up == "z"
@@ -110,4 +110,4 @@ def test_unknown_units_repeated_names_and_no_points(tmp_path):
 def test_missing_package_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "ezc3d", None)
     with pytest.raises(MotionError, match=r'need the package ezc3d; install it with: pip install "geomocap\[c3d\]"'):
-        write_c3d(tmp_path / "m.c3d", markers_from_run(skeleton_arrays()))
+        write_c3d(tmp_path / "m.c3d", markers_from_run(articulated_skeleton()))

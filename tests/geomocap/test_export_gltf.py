@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from geomocap.export.glb import write_glb
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.skinned_mesh import bone_mesh
-from tests.geomocap.articulated import skeleton_arrays
+from tests.geomocap.articulated import articulated_skeleton, skeleton_arrays, skeleton_of
 
 TYPES = {5126: np.float32, 5123: np.uint16, 5125: np.uint32}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -66,10 +66,10 @@ def z_up(points):
     return points[..., [0, 2, 1]] * [1, -1, 1]
 
 
-@pytest.mark.parametrize("kind", [{}, {"roots": 2}, {"jump_mm": 15.0}])
+@pytest.mark.parametrize("kind", [{}, {"jump_mm": 15.0}])
 def test_joints_read_back(tmp_path, kind):
     arrays = skeleton_arrays(**kind)
-    motion = motion_from_skeleton(arrays)
+    motion = motion_from_skeleton(skeleton_of(arrays))
     write_glb(tmp_path / "m.glb", motion)
     glb = Glb(tmp_path / "m.glb")
     for frame in range(20):
@@ -83,7 +83,7 @@ def test_joints_read_back(tmp_path, kind):
 
 
 def test_surface_is_moved_as_the_library_moves_it(tmp_path):
-    motion = motion_from_skeleton(skeleton_arrays())
+    motion = motion_from_skeleton(articulated_skeleton())
     mesh = bone_mesh(motion)
     write_glb(tmp_path / "m.glb", motion, mesh)
     glb, posed = Glb(tmp_path / "m.glb"), mesh.posed(motion)
@@ -93,7 +93,7 @@ def test_surface_is_moved_as_the_library_moves_it(tmp_path):
 
 def test_bones_run_between_the_joints_in_every_frame():
     arrays = skeleton_arrays()
-    motion = motion_from_skeleton(arrays)
+    motion = motion_from_skeleton(skeleton_of(arrays))
     posed = bone_mesh(motion).posed(motion)
     for joint in arrays["joint_positions"].swapaxes(0, 1):
         nearest = np.linalg.norm(posed - joint[:, None], axis=-1).min(axis=1)
@@ -101,6 +101,6 @@ def test_bones_run_between_the_joints_in_every_frame():
 
 
 def test_faces_look_outwards():
-    mesh = bone_mesh(motion_from_skeleton(skeleton_arrays(n_bodies=1, n_frames=2) | {"joint_bodies": np.zeros((0, 2))}))
+    mesh = bone_mesh(motion_from_skeleton(articulated_skeleton(n_bodies=1, n_frames=2)))
     outward = np.sum((mesh.vertices - mesh.vertices.mean(axis=0)) * mesh.normals, axis=1)
     assert (outward > 0).all()

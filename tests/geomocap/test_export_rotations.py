@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geomocap.export.file_rotations import fill_positions, fill_rotations, quaternions, rotation_about, zxy_angles
+from geomocap.export.skeleton_motion import fill_positions
+from geomocap.model.rotations import fill_rotations, quaternions, rotation_about, zxy_angles
 
 
 def compose(angles):

@@ -10,8 +10,9 @@ from geomocap.export.export_settings import ExportSettings
 from geomocap.export.names import Names
 from geomocap.export.run_export import FILES, export_run
 from geomocap.export.trc import read_trc
+from geomocap.files.results import write_ellipsoids
 from geomocap.files.run import Run
-from tests.geomocap.articulated import skeleton_arrays
+from tests.geomocap.articulated import shells_at, skeleton_arrays
 
 
 @pytest.fixture
@@ -79,7 +80,7 @@ def test_names_lie_in_the_run_or_are_given(run):
 
 def test_key_points_and_ellipsoids_are_markers(run):
     run.write_npz("keypoints.npz", names=np.array(["hat"]), positions=np.zeros((20, 1, 3)), radius=np.array([0.1]))
-    run.write_npz("ellipsoids.npz", centers=np.zeros((20, 2, 3)), body=np.array([0, 1]))
+    write_ellipsoids(run, shells_at(np.zeros((20, 2, 3)), [0, 1]))
     export_run(run, ["trc"])
     assert read_trc(run.path / "motion.trc").names[-3:] == ("hat", "ellipsoid000", "ellipsoid001")
     export_run(run, ["trc"], ExportSettings(ellipsoids=False))
@@ -89,7 +90,7 @@ def test_key_points_and_ellipsoids_are_markers(run):
 def test_an_ellipsoid_without_points_is_no_marker(run):
     counts = np.full((20, 2), 30)
     counts[4:7, 1] = 0
-    run.write_npz("ellipsoids.npz", centers=np.ones((20, 2, 3)), counts=counts, body=np.array([0, 1]))
+    write_ellipsoids(run, shells_at(np.ones((20, 2, 3)), [0, 1], counts))
     export_run(run, ["trc"])
     positions = read_trc(run.path / "motion.trc").positions[:, -2:]
     np.testing.assert_array_equal(np.isfinite(positions).all(axis=-1), counts > 0)
@@ -102,7 +103,7 @@ def test_one_body_without_joints(tmp_path):
     exported = export_run(run, ["bvh", "trc", "glb", "csv"])
     assert len(exported.files) == 4
     assert read_trc(tmp_path / "motion.trc").names == ("body00",)
-    run.write_npz("ellipsoids.npz", centers=np.zeros((20, 2, 3)), radii=np.full((20, 2, 3), 3.5), body=np.zeros(2))
+    write_ellipsoids(run, shells_at(np.zeros((20, 2, 3)), [0, 0], radius=3.5))
     export_run(run, ["bvh"])
     assert np.linalg.norm(read_bvh(tmp_path / "motion.bvh").tips[0]) == pytest.approx(3.5)
 

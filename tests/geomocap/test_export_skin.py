@@ -3,13 +3,15 @@ import open3d as o3d
 import pytest
 from scipy.spatial import cKDTree
 
+from geomocap.errors import GeometryError
 from geomocap.export.export_errors import MotionError
 from geomocap.export.export_settings import ExportSettings
-from geomocap.export.file_rotations import rotation_about
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.skin import majority, node_of_body, skin_from_run, skin_weights
 from geomocap.files.run import Run
+from geomocap.model.rotations import rotation_about
 from geomocap.model.surface import Surface, outward_normals, point_spacing, surface_through
+from tests.geomocap.articulated import skeleton_of
 
 VOXEL = 0.02
 RADIUS = 0.1
@@ -90,7 +92,7 @@ def test_same_points_same_surface():
 
 
 def test_skin_follows_the_bending_arm(arm_run):
-    motion = motion_from_skeleton(bending_arm())
+    motion = motion_from_skeleton(skeleton_of(bending_arm()))
     mesh = skin_from_run(arm_run, motion, ExportSettings(skin_triangles=5000))
     posed = mesh.posed(motion)
     np.testing.assert_allclose(posed[0], mesh.vertices, atol=1e-9)
@@ -107,8 +109,10 @@ def test_skin_follows_the_bending_arm(arm_run):
 
 
 def test_another_reference_frame_binds_in_its_pose(arm_run):
-    motion = motion_from_skeleton(bending_arm())
-    straight = motion_from_skeleton({k: v[::-1] if np.ndim(v) > 2 else v for k, v in bending_arm().items()})
+    motion = motion_from_skeleton(skeleton_of(bending_arm()))
+    straight = motion_from_skeleton(
+        skeleton_of({k: v[::-1] if np.ndim(v) > 2 else v for k, v in bending_arm().items()})
+    )
     settings = ExportSettings(skin_triangles=5000)
     for m in (motion, straight):
         mesh = skin_from_run(arm_run, m, settings)
@@ -143,14 +147,14 @@ def test_single_wrong_labels_are_outvoted(arm_run):
 
 
 def test_frames_and_points_that_make_no_skin(arm_run):
-    motion = motion_from_skeleton(bending_arm())
+    motion = motion_from_skeleton(skeleton_of(bending_arm()))
     with pytest.raises(MotionError, match=r"000005.ply: missing; the skin needs a frame that was segmented"):
         skin_from_run(arm_run, motion, ExportSettings(skin_frame=5))
     with pytest.raises(MotionError, match="no colours there"):
         skin_from_run(arm_run, motion, ExportSettings(skin_colors="true"))
-    with pytest.raises(MotionError, match="3 points are too few"):
+    with pytest.raises(GeometryError, match="3 points are too few"):
         surface_through(np.eye(3))
-    with pytest.raises(MotionError, match="all points lie in one place"):
+    with pytest.raises(GeometryError, match="all points lie in one place"):
         point_spacing(np.zeros((60, 3)))
     with pytest.raises(MotionError, match="body 7 has points but no place"):
         node_of_body(motion, np.array([0, 1, 7]))

@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 from geomocap.export.markers import Markers, markers_from_run
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.tables import motion_table, write_csv, write_parquet
-from tests.geomocap.articulated import skeleton_arrays
+from tests.geomocap.articulated import articulated_skeleton, skeleton_arrays, skeleton_of
 
 pandas = pytest.importorskip("pandas")
 
@@ -14,8 +14,8 @@ pandas = pytest.importorskip("pandas")
 def test_read_back_by_pandas(tmp_path, ending):
     arrays = skeleton_arrays()
     arrays["joint_positions"][4, 2] = np.nan
-    motion = motion_from_skeleton(arrays)
-    table = motion_table(markers_from_run(arrays), motion)
+    motion = motion_from_skeleton(skeleton_of(arrays))
+    table = motion_table(markers_from_run(skeleton_of(arrays)), motion)
     if ending == "csv":
         write_csv(tmp_path / "m.csv", table)
         read = pandas.read_csv(tmp_path / "m.csv")
@@ -40,4 +40,4 @@ def test_frames_must_agree():
     from geomocap.export.export_errors import MotionError
 
     with pytest.raises(MotionError, match="3 frames of markers, but 20"):
-        motion_table(Markers(("a",), np.zeros((3, 1, 3)), 15.0), motion_from_skeleton(skeleton_arrays()))
+        motion_table(Markers(("a",), np.zeros((3, 1, 3)), 15.0), motion_from_skeleton(articulated_skeleton()))

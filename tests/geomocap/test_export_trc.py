@@ -6,11 +6,12 @@ import pytest
 from geomocap.export.export_errors import MotionError
 from geomocap.export.markers import Markers, markers_from_run
 from geomocap.export.trc import read_trc, write_trc
-from tests.geomocap.articulated import skeleton_arrays
+from geomocap.model.keypoint_paths import KeyPointPaths, KeyPoints
+from tests.geomocap.articulated import articulated_skeleton, shells_at, skeleton_arrays, skeleton_of
 
 
 def markers_with_a_gap():
-    markers = markers_from_run(skeleton_arrays())
+    markers = markers_from_run(articulated_skeleton())
     positions = markers.positions.copy()
     positions[3:6, 1] = np.nan
     return Markers(markers.names, positions, markers.fps)
@@ -51,9 +52,11 @@ def test_header_says_units_rate_and_names(tmp_path):
 
 def test_markers_of_a_run_name_what_they_are():
     arrays = skeleton_arrays()
-    keypoints = {"names": np.array(["hat"]), "positions": np.zeros((20, 1, 3)), "radius": np.array([0.05])}
-    ellipsoids = {"centers": np.ones((20, 2, 3)), "body": np.array([4, -1])}
-    markers = markers_from_run(arrays, ellipsoids=ellipsoids, keypoints=keypoints)
+    none = np.zeros((20, 1))
+    paths = KeyPointPaths(np.zeros((20, 1, 3)), none > 0, none.astype(int), none)
+    keypoints = KeyPoints(("hat",), np.array([0.05]), paths, np.zeros((0, 2), int))
+    ellipsoids = shells_at(np.ones((20, 2, 3)), [4, -1])
+    markers = markers_from_run(skeleton_of(arrays), ellipsoids=ellipsoids, keypoints=keypoints)
     assert markers.names[-3:] == ("hat", "ellipsoid000", "ellipsoid001")
     assert markers.descriptions[-3:] == (
         "key-point, radius 50 mm",
@@ -61,7 +64,7 @@ def test_markers_of_a_run_name_what_they_are():
         "centre of an ellipsoid of no body",
     )
     with pytest.raises(MotionError, match="have \\[19, 20\\] frames"):
-        markers_from_run(arrays, ellipsoids={"centers": np.ones((19, 2, 3)), "body": np.array([4, -1])})
+        markers_from_run(skeleton_of(arrays), ellipsoids=shells_at(np.ones((19, 2, 3)), [4, -1]))
 
 
 @pytest.mark.parametrize(
@@ -79,7 +82,7 @@ def test_markers_of_a_run_name_what_they_are():
 def test_broken_files(tmp_path, change, says):
     arrays = skeleton_arrays()
     arrays["joint_names"] = np.array([f"joint_body00_body{b:02d}" for b in range(1, 7)])
-    write_trc(tmp_path / "m.trc", markers_from_run(arrays))
+    write_trc(tmp_path / "m.trc", markers_from_run(skeleton_of(arrays)))
     (tmp_path / "m.trc").write_text(change((tmp_path / "m.trc").read_text()))
     with pytest.raises(MotionError, match=says) as caught:
         read_trc(tmp_path / "m.trc")

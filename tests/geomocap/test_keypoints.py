@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -95,3 +97,19 @@ def test_wrong_input_is_refused(radii, frame, message):
     tracks = rigid_tracks(cloud(), 5, SHIFT, TURN)
     with pytest.raises(GeometryError, match=message):
         follow_keypoints(tracks, np.zeros((1, 3)), np.array(radii), frame)
+
+
+@pytest.mark.parametrize("scale", [0.01, 100.0])
+def test_a_small_subject_is_followed_like_a_large_one(scale):
+    tracks = rigid_tracks(cloud(), 15, SHIFT, TURN)
+    drifting = tracks.positions + np.random.default_rng(1).normal(0, 2e-3, tracks.positions.shape)
+    drifting[:40, 4:9] = np.nan
+    drifting[40:80, :6] = np.nan
+    center, radius = np.array([[0.05, 0.02, -0.03]]), np.array([0.05])
+    found = follow_keypoints(make_tracks(drifting), center, radius, 0)
+    tracks = make_tracks(scale * drifting)
+    tracks = replace(tracks, sigma=scale * tracks.sigma)
+    scaled = follow_keypoints(tracks, scale * center, scale * radius, 0)
+    assert_allclose(scaled.positions, scale * found.positions, atol=1e-6 * scale)
+    assert_allclose(scaled.std, scale * found.std, rtol=1e-4)
+    np.testing.assert_array_equal(scaled.n_tracks, found.n_tracks)

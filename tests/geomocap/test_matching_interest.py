@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from geomocap.matching.foerstner import foerstner, interest_points
-from geomocap.matching.wallis import WallisSettings, local_statistics, wallis
+from geomocap.matching.matching_settings import SeedSettings, WallisSettings
+from geomocap.matching.wallis import local_statistics, wallis
 
 
 def window_of(image: np.ndarray, row: int, column: int, half: int) -> np.ndarray:
@@ -66,7 +67,8 @@ def test_foerstner_agrees_with_its_definition() -> None:
 def test_corners_are_found_and_edges_are_not() -> None:
     image = np.zeros((80, 100))
     image[30:60, 40:80] = 200
-    points = interest_points(image, window=5, minimum_weight=0.0, cell=10).pixels
+    settings = SeedSettings(window=5, minimum_weight=0.0, minimum_roundness=0.5, cell=10)
+    points = interest_points(image, settings=settings).pixels
     corners = np.array([[40, 30], [80, 30], [40, 60], [80, 60]])
     distance = np.linalg.norm(points[:, None] - corners[None], axis=2)
     assert len(points) == 4
@@ -74,12 +76,12 @@ def test_corners_are_found_and_edges_are_not() -> None:
     assert len(interest_points(image, np.zeros_like(image)).pixels) == 0
     mask = np.zeros_like(image)
     mask[:, :60] = 1
-    assert interest_points(image, mask, window=5, minimum_weight=0.0, cell=10).pixels[:, 0].max() < 60
+    assert interest_points(image, mask, settings).pixels[:, 0].max() < 60
 
 
 def test_interest_points_keep_their_distance_and_limit() -> None:
     image = np.random.default_rng(3).uniform(0, 255, (120, 160))
-    found = interest_points(image, cell=12, limit=40)
+    found = interest_points(image, settings=SeedSettings(minimum_weight=0.5, minimum_roundness=0.5, cell=12, limit=40))
     assert len(found.pixels) == 40
     assert (np.diff(found.weight) <= 0).all()
     apart = np.linalg.norm(found.pixels[:, None] - found.pixels[None], axis=2) + 99 * np.eye(40)

@@ -6,12 +6,14 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from geomocap.bodies.body_criteria import fixed_fraction, may_be_joined
-from geomocap.bodies.motion_bodies import MotionBodiesSettings, find_motion_bodies
+from geomocap.bodies.body_settings import MotionBodiesSettings
+from geomocap.bodies.motion_bodies import find_motion_bodies
 from geomocap.bodies.point_labels import label_points
 from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.rotations import turn_angles
-from geomocap.pipeline.motion_stage import unsure_turns
+from geomocap.motion import unsure_turns
+from geomocap.skeleton.bone_motion import forward_kinematics
 from geomocap.skeleton.borders import Border
 from geomocap.skeleton.common_points import common_point
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
@@ -77,7 +79,7 @@ def test_bodies_are_not_split_where_turns_are_unsure(three, seed):
 
 
 def test_turns_of_noise_are_called_unsure(three, found):
-    assert unsure_turns(found) == []
+    assert unsure_turns(found) == ()
     noise = np.random.default_rng(0).normal(0, 0.2, three.positions.shape)  # metres, of boxes 0.12 m wide
     (warning,) = unsure_turns(find_motion_bodies(MotionPaths(three.positions + noise)))
     assert "not to be trusted" in warning and "more cameras" in warning
@@ -247,7 +249,8 @@ def test_where_on_its_axis_a_hinge_is():
 
 def test_joints_stay_fixed_in_both_bodies_and_follow_forward_kinematics(found):
     skeleton = find_motion_skeleton(found, 30.0).skeleton
-    np.testing.assert_allclose(skeleton.bone_fixed_positions(), skeleton.joint_positions, atol=1e-9)
+    bones = (skeleton.hierarchy, skeleton.offsets, skeleton.local_rotations, skeleton.root_positions)
+    np.testing.assert_allclose(forward_kinematics(*bones)[0], skeleton.joint_positions, atol=1e-9)
     between = np.linalg.norm(skeleton.joint_positions[:, 0] - skeleton.joint_positions[:, 1], axis=1)
     siblings = skeleton.joint_bodies[0, 0] == skeleton.joint_bodies[1, 0]
     chained = skeleton.joint_bodies[0, 1] == skeleton.joint_bodies[1, 0]

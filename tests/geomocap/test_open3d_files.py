@@ -8,6 +8,7 @@ import pytest
 import trimesh
 
 from geomocap.errors import GeometryError
+from geomocap.files.frame_files import write_points, write_voxels
 from geomocap.files.open3d_geometry import check_ply, read_by_open3d
 from geomocap.model.frame_geometry import BodyPoints, Voxels
 
@@ -39,8 +40,9 @@ def test_polygons_of_several_lengths_are_counted_one_by_one(tmp_path):
 
 def test_files_of_a_run_are_whole(tmp_path):
     points = np.random.default_rng(0).normal(size=(20, 3))
-    BodyPoints(points, np.zeros(20, int)).write(tmp_path / "bodies.ply")
-    Voxels(np.eye(3, dtype=np.int32), np.zeros((3, 3), np.uint8), np.zeros(3), 0.1).write(tmp_path / "voxels.ply")
+    write_points(tmp_path / "bodies.ply", BodyPoints(points, np.zeros(20, int)))
+    voxels = Voxels(np.eye(3, dtype=np.int32), np.zeros((3, 3), np.uint8), np.zeros(3), 0.1)
+    write_voxels(tmp_path / "voxels.ply", voxels)
     for name in ("bodies.ply", "voxels.ply"):
         file = tmp_path / name
         check_ply(file)

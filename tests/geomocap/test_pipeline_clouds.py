@@ -11,9 +11,10 @@ import open3d as o3d
 import pytest
 
 from geomocap.config import load_config
-from geomocap.dense import CloudSettings
+from geomocap.dense.dense_settings import CloudSettings
 from geomocap.errors import GeometryError, RunError
 from geomocap.files.capture import Capture, CaptureInfo, write_capture_info
+from geomocap.files.rigs import write_rig
 from geomocap.files.run import Run
 from geomocap.pipeline import Job, clouds, read_cloud_record
 from geomocap.pipeline.cloud_stage import bounds_of, measure_again
@@ -28,7 +29,7 @@ COARSE = {"cloud": {"growing": {"step": 4.0, "radius": 4}}}
 def make_capture(path: Path, frames: int = 1, masks: bool = False, cameras: int = 3) -> Capture:
     rig = ring(cameras, 40)
     write_capture_info(path, CaptureInfo(name="ball", fps=10.0, region_of_interest=BOX))
-    rig.write(path / "sparse")
+    write_rig(path / "sparse", rig)
     for k in range(frames):
         images, silhouettes = photograph(rig, Texture.random(), seed=k)
         for name, image, mask in zip(rig.names, images, silhouettes, strict=True):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geomocap.errors import RunError, SettingsError
+from geomocap.errors import GeometryError, RunError, SettingsError
 from geomocap.export.c3d import read_c3d
 from geomocap.export.trc import read_trc
 from geomocap.files.run import Run
@@ -122,7 +122,7 @@ def test_nodes_stand_in_where_bodies_were_found_from_them(scene):
     with pytest.raises(RunError, match=r"has no tracks\.npz"):
         keypoints(run, file)
     run.write_npz("diagnostics.npz", sample_positions=positions, paths=np.array("nodes"))
-    np.testing.assert_allclose(keypoints(run, file).paths.positions, truth, atol=1e-5)
+    np.testing.assert_allclose(keypoints(run, file).points.paths.positions, truth, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -134,6 +134,6 @@ def test_nodes_stand_in_where_bodies_were_found_from_them(scene):
     ],
 )
 def test_key_points_that_nothing_moves_are_named(scene, points, said):
-    with pytest.raises(RunError, match=said):
+    with pytest.raises(GeometryError, match=said):
         keypoints(scene[0], KeyPointFile(keypoint=points))
     assert not (scene[0].path / "keypoints.npz").exists()

@@ -11,6 +11,7 @@ import pytest
 from geomocap.config import Config
 from geomocap.errors import GeometryError
 from geomocap.files.run import Run
+from geomocap.model.trajectories import Trajectories
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.path_choice import ALONE_FRACTION, motion_paths, patch_paths
@@ -103,12 +104,13 @@ def test_patches_that_are_not_there(job):
 
 def test_rays_go_with_the_paths_where_single_cameras_saw_them():
     tracks = trajectories(40, 1.0)
-    tracked = {"positions": tracks, "sigma": np.full(tracks.shape[:2], 0.002), "ray": np.zeros(tracks.shape)}
+    ray = np.zeros(tracks.shape)
+    tracked = Trajectories.of_positions(tracks, sigma=np.full(tracks.shape[:2], 0.002), ray=ray)
     found = patch_paths(tracked)
     assert found is not None and found.ray is None
-    tracked["ray"][::2, 1] = [0.0, 0.6, 0.8]
+    ray[::2, 1] = [0.0, 0.6, 0.8]
     found = patch_paths(tracked)
     assert found is not None and found.ray is not None and found.sigma is not None
-    np.testing.assert_array_equal(found.ray, tracked["ray"])
+    np.testing.assert_array_equal(found.ray, ray)
     np.testing.assert_allclose(found.sigma[::2, 1], 0.002 * ALONE_FRACTION)
     np.testing.assert_allclose(np.delete(found.sigma, 1, axis=1), 0.002)

@@ -10,8 +10,11 @@ import pytest
 
 from geomocap.errors import RunError
 from geomocap.files.atomic import write_atomic, write_text
+from geomocap.files.frame_files import read_voxels, write_voxels
 from geomocap.files.run import Run, stage_key
 from geomocap.model.frame_geometry import Voxels
+
+HERE = "geomocap.files.run"
 
 
 def test_interrupted_writing_leaves_nothing(tmp_path):
@@ -67,13 +70,13 @@ def test_stage_with_a_deleted_output_is_not_done(tmp_path):
 
 def test_key_depends_on_everything():
     keys = {
-        stage_key("a", {"x": 1}),
-        stage_key("a", {"x": 2}),
-        stage_key("b", {"x": 1}),
-        stage_key("a", {"x": 1}, "up"),
+        stage_key(HERE, "a", {"x": 1}),
+        stage_key(HERE, "a", {"x": 2}),
+        stage_key(HERE, "b", {"x": 1}),
+        stage_key(HERE, "a", {"x": 1}, "up"),
     }
     assert len(keys) == 4
-    assert stage_key("a", {"x": 1, "y": 2}) == stage_key("a", {"y": 2, "x": 1})
+    assert stage_key(HERE, "a", {"x": 1, "y": 2}) == stage_key(HERE, "a", {"y": 2, "x": 1})
 
 
 def test_of_an_npz_file_what_is_named_is_read(tmp_path):
@@ -109,8 +112,8 @@ def test_voxels_survive_open3d_s_file(tmp_path):
     indices = np.unique(rng.integers(0, 60, (2000, 3)).astype(np.int32), axis=0)
     colors = rng.integers(0, 256, (len(indices), 3)).astype(np.uint8)
     voxels = Voxels(indices, colors, np.array([-1.0, 0.3, 0.7]), 0.0078125)
-    voxels.write(tmp_path / "000000.ply")
-    back = Voxels.read(tmp_path / "000000.ply")
+    write_voxels(tmp_path / "000000.ply", voxels)
+    back = read_voxels(tmp_path / "000000.ply")
     np.testing.assert_array_equal(back.indices, voxels.indices)
     np.testing.assert_array_equal(back.colors, voxels.colors)
     np.testing.assert_allclose(back.points, voxels.points, atol=1e-9)
@@ -118,7 +121,7 @@ def test_voxels_survive_open3d_s_file(tmp_path):
     np.testing.assert_array_equal(back.indices, slow.indices)
     np.testing.assert_array_equal(back.colors, slow.colors)
     o3d.io.write_voxel_grid(str(tmp_path / "ascii.ply"), voxels.to_open3d(), write_ascii=True)
-    np.testing.assert_array_equal(Voxels.read(tmp_path / "ascii.ply").indices, voxels.indices)
+    np.testing.assert_array_equal(read_voxels(tmp_path / "ascii.ply").indices, voxels.indices)
 
 
 @pytest.mark.parametrize("inside", ["", "further/in"])

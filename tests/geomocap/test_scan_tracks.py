@@ -14,8 +14,9 @@ from geomocap.config import load_config
 from geomocap.errors import GeometryError
 from geomocap.files.run import Run
 from geomocap.files.scan_geometry import ScanSurface, places_on
+from geomocap.files.scan_settings import ScanSettings
 from geomocap.files.scan_tracks import scan_tracks
-from geomocap.files.scans import Scans, ScanSettings, open_scans
+from geomocap.files.scans import Scans, open_scans
 from geomocap.pipeline import Job, segment
 from geomocap.scheduling import threads
 
@@ -125,3 +126,14 @@ def test_too_few_points_to_tell_bodies_by(tmp_path):
         job = Job(Run(tmp_path / "run"), config, executor, scans=scans)
         with pytest.raises(GeometryError, match="motion paths: 5 samples; at least 20 are needed"):
             segment(job, "scans")
+
+
+def test_tracks_one_after_the_other_are_read_as_scans(tmp_path):
+    file = tmp_path / "tracks.npz"
+    points = np.arange(15.0).reshape(5, 3)
+    layout = {"first": np.array([0, 3, 5]), "start": np.array([0, 2]), "end": np.array([3, 4]), "n_frames": 4}
+    np.savez(file, layout="ragged", positions=points, **layout)
+    scans = open_scans(file, ScanSettings(spacing=0.1))
+    assert len(scans) == 4 and scans.tracked
+    np.testing.assert_array_equal(scans.surface(2).points, [points[2], points[3]])
+    np.testing.assert_array_equal(scans.points(3), [points[4]])

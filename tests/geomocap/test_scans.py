@@ -13,8 +13,10 @@ import trimesh
 from geomocap.config import load_config
 from geomocap.errors import GeometryError
 from geomocap.export.run_export import run_up
+from geomocap.files.frame_files import write_voxels
 from geomocap.files.run import Run
-from geomocap.files.scans import ScanSettings, open_scans
+from geomocap.files.scan_settings import ScanSettings
+from geomocap.files.scans import open_scans
 from geomocap.model.frame_geometry import Voxels
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.sources import geometry_of
@@ -23,7 +25,7 @@ from geomocap.scheduling import threads
 
 @pytest.mark.parametrize("ending", ["ply", "obj", "stl", "glb"])
 def test_mesh_is_sampled_on_its_surface_evenly(tmp_path, ending):
-    trimesh.creation.box(diagonals=(2, 4, 6)).export(tmp_path / f"box.{ending}")
+    trimesh.creation.box(extents=(2, 4, 6)).export(tmp_path / f"box.{ending}")
     scans = open_scans(tmp_path / f"box.{ending}", ScanSettings(samples=8800))
     points = scans.points(0)
     on_face = np.isclose(np.abs(points), [1, 2, 3], atol=1e-5)
@@ -43,7 +45,7 @@ def test_cloud_is_read_as_it_is(tmp_path, ending):
 
 def test_voxel_grid_gives_its_centres(tmp_path):
     indices = np.array([[0, 0, 0], [1, 2, 3]], np.int32)
-    Voxels(indices, np.zeros((2, 3), np.uint8), np.array([1.0, 2, 3]), 0.1).write(tmp_path / "v.ply")
+    write_voxels(tmp_path / "v.ply", Voxels(indices, np.zeros((2, 3), np.uint8), np.array([1.0, 2, 3]), 0.1))
     np.testing.assert_allclose(
         open_scans(tmp_path / "v.ply", ScanSettings()).points(0), [[1.05, 2.05, 3.05], [1.15, 2.25, 3.35]]
     )
@@ -100,7 +102,7 @@ def test_nan_points_are_missing_in_every_format(tmp_path):
         np.testing.assert_array_equal(open_scans(tmp_path / name, ScanSettings()).points(0), expected)
     with pytest.raises(GeometryError, match=r"c\.npz, frame 1: all 6 points are missing \(NaN\)"):
         open_scans(tmp_path / "c.npz", ScanSettings()).points(1)
-    box = trimesh.creation.box(diagonals=(2, 4, 6))
+    box = trimesh.creation.box(extents=(2, 4, 6))
     box.vertices[0] = np.nan
     box.export(tmp_path / "d.ply")
     assert np.isfinite(open_scans(tmp_path / "d.ply", ScanSettings()).points(0)).all()
@@ -119,7 +121,7 @@ def test_points_that_can_be_no_surface_are_refused(tmp_path):
     np.save(tmp_path / "away.npy", np.eye(3) + 1e7)
     with pytest.raises(GeometryError, match=r"away\.npy, frame 0: .* from the origin.*subtract the same offset"):
         open_scans(tmp_path / "away.npy", ScanSettings()).points(0)
-    box = trimesh.creation.box(diagonals=(2, 4, 6))
+    box = trimesh.creation.box(extents=(2, 4, 6))
     box.vertices[0] = np.inf
     box.export(tmp_path / "far.ply")
     with pytest.raises(GeometryError, match=r"far\.ply: .*infinite"):

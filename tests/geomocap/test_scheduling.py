@@ -40,7 +40,7 @@ def test_first_error_is_raised_and_the_rest_not_begun():
         list(map_items(work, range(100), executor, ahead=2))
 
 
-def test_threads_fraction_the_cores():
+def test_threads_share_the_cores():
     with threads(2) as executor:
         names = set(executor.map(lambda _: threading.current_thread().name, range(8)))
     assert 1 <= len(names) <= 2

@@ -13,6 +13,7 @@ from geomocap.segmentation.m3 import segment_m3
 from geomocap.segmentation.m3_result import Segmentation
 from geomocap.segmentation.m3_settings import SegmentationSettings
 from geomocap.segmentation.relative_paths import group_paths, path_integrals, similarity_threshold, unite
+from tests.geomocap.articulated import alike
 from tests.geomocap.segmentation_scenes import hinged_arm
 
 SPACING = 0.008
@@ -41,16 +42,16 @@ def test_bodies_keep_to_the_parts(arm, segmentation):
 
 def test_shapes_and_counts(arm, segmentation):
     points, _, _ = arm
-    arrays = segmentation.arrays()
-    frames, count = arrays["counts"].shape
+    shells = segmentation.ellipsoids
+    frames, count = shells.counts.shape
     assert frames == len(points)
-    assert arrays["centers"].shape == arrays["radii"].shape == (frames, count, 3)
-    assert arrays["rotations"].shape == (frames, count, 3, 3)
-    assert arrays["body"].shape == (count,)
-    assert (np.diff(arrays["radii"], axis=-1) <= 0).all()
-    assert (arrays["counts"].sum(axis=1) == [len(p) for p in points]).all()
+    assert shells.centers.shape == shells.radii.shape == (frames, count, 3)
+    assert shells.rotations.shape == (frames, count, 3, 3)
+    assert segmentation.body.shape == (count,)
+    assert (np.diff(shells.radii, axis=-1) <= 0).all()
+    assert (shells.counts.sum(axis=1) == [len(p) for p in points]).all()
     bodies = segmentation.body_count
-    assert set(arrays["body"]) == set(range(bodies))
+    assert set(segmentation.body) == set(range(bodies))
     assert segmentation.body_positions.shape == (frames, bodies, 3)
     np.testing.assert_allclose(np.linalg.det(segmentation.body_rotations), 1.0)
     np.testing.assert_allclose(segmentation.body_rotations[0], np.tile(np.eye(3), (bodies, 1, 1)), atol=1e-12)
@@ -81,8 +82,8 @@ def test_the_same_whatever_the_executor(arm, segmentation):
     points, _, _ = arm
     with ThreadPoolExecutor(3) as executor:
         again = segment_m3(points.__getitem__, len(points), spacing=SPACING, settings=SETTINGS, executor=executor)
-    for name, array in segmentation.arrays().items():
-        np.testing.assert_array_equal(array, again.arrays()[name])
+    alike(segmentation.ellipsoids, again.ellipsoids)
+    np.testing.assert_array_equal(segmentation.body, again.body)
     np.testing.assert_array_equal(segmentation.body_rotations, again.body_rotations)
 
 

@@ -9,19 +9,18 @@ import numpy as np
 import pytest
 
 from geomocap.errors import CaptureError, SettingsError
-from geomocap.silhouettes import (
+from geomocap.silhouettes.background import (
     BackgroundModel,
-    SilhouetteSettings,
-    coverage,
+    add_agreeing,
+    agreement,
     model_from_frames,
     model_from_plate,
-    region_of_box,
-    region_of_points,
-    silhouette,
 )
-from geomocap.silhouettes.background import add_agreeing, agreement
 from geomocap.silhouettes.evidence import background_evidence, shadow_evidence, smooth_evidence
+from geomocap.silhouettes.extraction import coverage, silhouette
 from geomocap.silhouettes.light import light_change
+from geomocap.silhouettes.region import region_of_box, region_of_points
+from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 W, H = 320, 240
 FINE = 4  # supersampling of the scene

@@ -8,14 +8,16 @@ from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
 from geomocap.model.hierarchy import Hierarchy
+from geomocap.model.skeleton import Skeleton
 from geomocap.segmentation.axis_joints import grow_joints
 from geomocap.segmentation.body_connections import connect_bodies
 from geomocap.segmentation.m3 import segment_m3
 from geomocap.segmentation.m3_result import Segmentation
 from geomocap.segmentation.m3_settings import SegmentationSettings
 from geomocap.segmentation.skeleton_settings import SkeletonSettings
-from geomocap.skeleton.bone_motion import fit_motion, fit_offsets, forward_kinematics, local_rotations
-from geomocap.skeleton.m3_skeleton import Skeleton, skeleton_m3
+from geomocap.skeleton.bone_motion import fit_motion, fit_offsets, forward_kinematics
+from geomocap.skeleton.m3_skeleton import skeleton_m3
+from tests.geomocap.articulated import alike
 from tests.geomocap.segmentation_scenes import hinged_arm
 
 SPACING = 0.008
@@ -115,7 +117,7 @@ def test_forward_kinematics_by_hand():
     joints, world = forward_kinematics(CHAIN, offsets, local, np.array([[5.0, 0, 0]]))
     np.testing.assert_allclose(joints[0], [[5, 1, 0], [4, 1, 0], [4, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(world[0, 1], turn @ turn, atol=1e-12)
-    np.testing.assert_allclose(local_rotations(world, CHAIN), local, atol=1e-12)
+    np.testing.assert_allclose(CHAIN.local_rotations(world), local, atol=1e-12)
 
 
 def test_offsets_of_known_bones_are_recovered():
@@ -136,9 +138,9 @@ def test_wrong_rotations_are_turned_towards_the_joints():
     noisy = noise.reshape(world.shape) @ since_start
     noisy[0] = np.eye(3)
     turned, offsets, _ = fit_motion(CHAIN, noisy, root, joints, centers)
-    fitted, _ = forward_kinematics(CHAIN, offsets, local_rotations(turned, CHAIN), root)
+    fitted, _ = forward_kinematics(CHAIN, offsets, CHAIN.local_rotations(turned), root)
     before, _ = fit_offsets(CHAIN, noisy, root, joints, centers)
-    unfitted, _ = forward_kinematics(CHAIN, before, local_rotations(noisy, CHAIN), root)
+    unfitted, _ = forward_kinematics(CHAIN, before, CHAIN.local_rotations(noisy), root)
     miss = np.linalg.norm(fitted - joints, axis=-1).mean()
     assert miss < 0.6 * np.linalg.norm(unfitted - joints, axis=-1).mean()
     np.testing.assert_array_equal(turned[0], np.tile(np.eye(3), (4, 1, 1)))
@@ -163,7 +165,8 @@ def test_hinge_is_found(segmentation, skeleton):
 
 
 def test_fixed_joints_are_the_forward_kinematics(skeleton):
-    positions = skeleton.bone_fixed_positions()
+    bones = (skeleton.hierarchy, skeleton.offsets, skeleton.local_rotations, skeleton.root_positions)
+    positions = forward_kinematics(*bones)[0]
     if skeleton.fixed_joints:
         np.testing.assert_array_equal(skeleton.joint_positions, positions)
     else:
@@ -179,24 +182,12 @@ def test_skeleton_keeps_its_promises(segmentation, skeleton):
     np.testing.assert_allclose(np.linalg.det(skeleton.body_rotations), 1.0)
     steps = np.einsum("tbji,tbjk->tbik", skeleton.body_rotations[:-1], skeleton.body_rotations[1:])
     assert Rotation.from_matrix(steps.reshape(-1, 3, 3)).magnitude().max() < 1.2  # no axis flips
-    assert skeleton.parents[skeleton.root] == -1
-
-
-def test_arrays_and_back(skeleton):
-    arrays = skeleton.arrays()
-    assert all(array.dtype != object for array in arrays.values())
-    again = Skeleton.from_arrays(arrays)
-    for name, array in arrays.items():
-        np.testing.assert_array_equal(array, again.arrays()[name])
-    del arrays["offsets"]
-    with pytest.raises(GeometryError, match="no array 'offsets'"):
-        Skeleton.from_arrays(arrays)
+    assert skeleton.hierarchy.parents[skeleton.root] == -1
 
 
 def test_the_same_twice(segmentation, skeleton):
     again = skeleton_m3(segmentation, 15, SkeletonSettings(fixed_joints=skeleton.fixed_joints))
-    for name, array in skeleton.arrays().items():
-        np.testing.assert_array_equal(array, again.arrays()[name])
+    alike(skeleton, again)
 
 
 def test_bad_shapes_are_refused(skeleton):

@@ -2,15 +2,17 @@ import numpy as np
 import pygltflib
 import pytest
 
-from geomocap.bodies.motion_bodies import MotionBodiesSettings, find_motion_bodies
+from geomocap.bodies.body_settings import MotionBodiesSettings
+from geomocap.bodies.motion_bodies import find_motion_bodies
 from geomocap.errors import GeometryError
 from geomocap.export.run_export import export_run
+from geomocap.files.results import write_skeleton
 from geomocap.files.run import Run
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.skeleton.kinematics import JointMotion, body_motion
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
 from geomocap.subject.model_building import BodyCloud, build_model, key_poses
-from geomocap.subject.subject_model import SubjectModel, read_model, rotation_limits
+from geomocap.subject.subject_model import SubjectModel, read_model, rotation_limits, write_model
 from tests.geomocap.moving_chains import chain
 
 SPACING = 0.012
@@ -46,7 +48,7 @@ def sequence():
 @pytest.fixture(scope="module")
 def model(sequence):
     bodies, found, _, read = sequence
-    return build_model(found, bodies, np.array([True]), read, SPACING)
+    return build_model(found, bodies, read, SPACING)
 
 
 def test_surface_is_the_boxes(model, sequence):
@@ -72,7 +74,7 @@ def test_a_point_that_one_frame_invents_is_left_out(sequence):
             np.concatenate([cloud.points, ghost]), np.append(cloud.body, 0), np.concatenate([cloud.colors, ghost])
         )
 
-    model = build_model(found, bodies, np.array([True]), with_ghost, SPACING)
+    model = build_model(found, bodies, with_ghost, SPACING)
     assert np.linalg.norm(model.points - 0.5, axis=1).min() > 0.2
 
 
@@ -92,7 +94,7 @@ def test_key_poses_are_far_apart():
 
 
 def test_model_file_comes_back_as_it_was(model, tmp_path):
-    Run(tmp_path).write_npz("model.npz", **model.arrays())
+    write_model(tmp_path / "model.npz", model)
     again = read_model(tmp_path / "model.npz")
     for name in SubjectModel.__dataclass_fields__:
         np.testing.assert_array_equal(getattr(again, name), getattr(model, name))
@@ -136,7 +138,8 @@ def broken(arrays, how):
 
 @pytest.mark.parametrize("how", ["shape", "missing", "tree", "numbers", "version", "other"])
 def test_bad_model_gives_one_clear_line(model, tmp_path, how):
-    Run(tmp_path).write_npz("model.npz", **broken(model.arrays(), how))
+    write_model(tmp_path / "model.npz", model)
+    Run(tmp_path).write_npz("model.npz", **broken(Run(tmp_path).read_npz("model.npz"), how))
     with pytest.raises(GeometryError) as error:
         read_model(tmp_path / "model.npz")
     assert "model.npz" in str(error.value) and "\n" not in str(error.value)
@@ -153,8 +156,8 @@ def test_damaged_and_missing_files_give_one_clear_line(tmp_path):
 def test_glb_shows_the_models_skin_with_its_weights(model, sequence, tmp_path):
     _, found, _, _ = sequence
     run = Run(tmp_path)
-    run.write_npz("model.npz", **model.arrays())
-    run.write_npz("skeleton.npz", **found.skeleton.arrays())
+    write_model(tmp_path / "model.npz", model)
+    write_skeleton(run, found.skeleton)
     export_run(run, ["glb"])
     file = pygltflib.GLTF2().load(tmp_path / "motion.glb")
     assert len(file.skins[0].joints) == 2

@@ -4,8 +4,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from geomocap.errors import GeometryError
 from geomocap.model.trajectories import TOO_FAST, UNLIKE, Trajectories
-from geomocap.trajectories.filters import FilterSettings, departure, filter_trajectories
-from geomocap.trajectories.smoothing import SmoothingSettings, smooth_motion
+from geomocap.trajectories.filters import departure, filter_trajectories
+from geomocap.trajectories.smoothing import smooth_motion
+from geomocap.trajectories.trajectory_settings import FilterSettings, SmoothingSettings
 from tests.geomocap.made_trajectories import join_tracks, make_tracks, rigid_tracks
 
 FPS = 30.0

@@ -14,6 +14,8 @@ import pycolmap
 import pytest
 
 from geomocap.files.capture import Capture, CaptureInfo, write_capture_info
+from geomocap.files.frame_files import write_voxels
+from geomocap.files.rigs import write_rig
 from geomocap.files.run import Run
 from geomocap.model.frame_geometry import Voxels
 from geomocap.model.rig import Rig
@@ -97,7 +99,7 @@ def make_rig(count: int, width: int, height: int) -> Rig:
 def make_capture(path: Path, figure: Figure, rig: Rig) -> Capture:
     """Photographs: the figure's points as dots on a plain wall; silhouettes are those dots, closed."""
     write_capture_info(path, CaptureInfo(name="stick figure", fps=30.0))
-    rig.write(path / "sparse")
+    write_rig(path / "sparse", rig)
     for c, name in enumerate(rig.names):
         (path / "images" / name).mkdir(parents=True)
         width, height = rig.sizes[c]
@@ -123,7 +125,7 @@ def make_run(path: Path, figure: Figure, rig: Rig) -> Run:
         points, bodies = figure.points(t, 1500)
         indices, first = np.unique(np.floor((points - origin) / size).astype(np.int32), axis=0, return_index=True)
         colors = (0.5 * body_colors(bodies[first]) + 70).astype(np.uint8)
-        Voxels(indices, colors, origin, size).write(run.frame_file("voxels", t))
+        write_voxels(run.frame_file("voxels", t), Voxels(indices, colors, origin, size))
         cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor((origin + (indices + 0.5) * size).astype(np.float32)))
         labels = np.where(np.arange(len(first)) % 97 == 0, -1, bodies[first]).astype(np.int32)
         cloud.point["body"] = o3d.core.Tensor(labels[:, None])

@@ -2,7 +2,8 @@ import re
 
 import pytest
 
-from geomocap.evaluation import EvaluationSettings, evaluate
+from geomocap.evaluation.evaluation_settings import EvaluationSettings
+from geomocap.evaluation.run_evaluation import evaluate
 from geomocap.export.run_export import export_run
 from tests.geomocap.made_truth import flawed_run, write_truth
 from viz.evaluation_report import evaluation_report, worst_frame

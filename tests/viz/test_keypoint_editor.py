@@ -15,15 +15,16 @@ import pytest
 
 from geomocap.errors import GeomocapError, SettingsError
 from geomocap.export.export_errors import MissingPackageError
+from geomocap.files.results import read_followed
 from geomocap.keypoints.keypoint_following import KeyPointPaths, Measured
 from geomocap.keypoints.keypoint_regions import KeyPoint, KeyPointFile, read_keypoints, write_keypoints
-from geomocap.pipeline.keypoint_stage import keypoints, run_trajectories
+from geomocap.pipeline.keypoint_stage import keypoints
 from tests.viz.conftest import Figure, Made, make
 from viz.keypoint_editor import KeyPointEditor
 from viz.keypoint_marks import BRIDGED, MEASURED, Marks, marked
 from viz.keypoint_scene import Subject, marks_of, timeline
 from viz.keypoint_session import Follower, Session
-from viz.results import Results
+from viz.run_contents import Results
 
 FRAMES = 6
 HEAD, KNEE = 1, 7  # bodies of the figure
@@ -45,7 +46,7 @@ def scene(tmp_path: Path) -> Made:
 
 
 def subject_of(made: Made) -> Subject:
-    return Subject(Results(made.run, made.capture), run_trajectories(made.run).positions, 30.0)
+    return Subject(Results(made.run, made.capture), read_followed(made.run).positions, 30.0)
 
 
 # --- what is shown ---
@@ -124,7 +125,7 @@ def served(made: Made, save: Callable[[KeyPointFile], str] | None = None) -> Ite
         return "Saved keypoints.toml."
 
     begun = read_keypoints(file) if file.exists() else KeyPointFile()
-    follow = Follower(Measured.of(run_trajectories(made.run)))
+    follow = Follower(Measured.of(read_followed(made.run)))
     editor = KeyPointEditor(subject_of(made), follow, Session.open(begun), save or write, port=18400)
     stop = threading.Event()
     thread = threading.Thread(target=editor.serve, args=(lambda: not stop.is_set(),))
@@ -180,7 +181,7 @@ def test_what_cannot_be_saved_is_said(scene):
 
 def test_without_viser_one_line_names_the_extra(scene, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "viser", None)
-    follow = Follower(Measured.of(run_trajectories(scene.run)))
+    follow = Follower(Measured.of(read_followed(scene.run)))
     with pytest.raises(MissingPackageError, match=r"need the package viser.*geomocap\[editor\]") as error:
         KeyPointEditor(subject_of(scene), follow, Session(), lambda file: "")
     assert isinstance(error.value, GeomocapError)

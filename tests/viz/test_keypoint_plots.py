@@ -12,9 +12,9 @@ from geomocap.errors import RunError
 from geomocap.files.run import Run
 from tests.viz.conftest import Made, make
 from viz import review
-from viz.keypoint_marks import BRIDGED, MEASURED
-from viz.keypoint_plots import overlay_sheet, paths, read_marks, speeds
-from viz.results import Results
+from viz.keypoint_marks import BRIDGED, MEASURED, marks_of_run
+from viz.keypoint_plots import overlay_sheet, paths, speeds
+from viz.run_contents import Results
 from viz.scene import stage
 
 HEAD, HAND = 1, 3
@@ -45,15 +45,15 @@ def pixels(png: bytes) -> np.ndarray:
 
 
 def test_a_run_without_key_points_has_no_marks(made: Made, tmp_path):
-    assert read_marks(Results(made.run)) is None
+    assert Results(made.run).keypoints is None
     Run(tmp_path).write_npz("keypoints.npz", names=np.array(["a"]), positions=np.zeros((3, 1, 3)))
     with pytest.raises(RunError, match=r"keypoints\.npz: has no array radius"):
-        read_marks(Results(Run(tmp_path)))
+        _ = Results(Run(tmp_path)).keypoints
 
 
 def test_plots_show_every_key_point(made_with_keypoints):
     results = Results(made_with_keypoints.run, made_with_keypoints.capture)
-    marks = read_marks(results)
+    marks = marks_of_run(results.keypoints)
     assert marks.names == ("head", "hand") and marks.states[:, 1].tolist() == [2, 2, 1, 1, 0, 0]
     for picture in (paths(marks, stage(results)), speeds(marks, np.ones((6, 2, 3)), FPS)):
         colors = {tuple(c) for c in pixels(picture).reshape(-1, 3).tolist()}
@@ -62,7 +62,7 @@ def test_plots_show_every_key_point(made_with_keypoints):
 
 def test_pictures_tell_measured_from_bridged(made_with_keypoints):
     results = Results(made_with_keypoints.run, made_with_keypoints.capture)
-    marks = read_marks(results)
+    marks = marks_of_run(results.keypoints)
     for frame, expected in ((0, {MEASURED}), (2, {MEASURED, BRIDGED}), (5, {MEASURED})):
         sheet = overlay_sheet(results, marks, [frame])
         colors = {tuple(c) for c in sheet.reshape(-1, 3).tolist()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,13 @@ import open3d as o3d
 import pytest
 
 from geomocap.config import load_config
-from geomocap.dense import CloudFrame, CloudSettings, cloud_of_frame, match_groups, undistorted_color
+from geomocap.dense.dense_frame import CloudFrame, cloud_of_frame
+from geomocap.dense.dense_settings import CloudSettings
+from geomocap.dense.match_groups import match_groups
+from geomocap.dense.matching_images import undistorted_color
 from geomocap.files.run import Run
 from geomocap.pipeline import Job, clouds
+from geomocap.pipeline.cloud_stage import measure_again
 from geomocap.scheduling import threads
 from tests.geomocap.ball import RADIUS, Texture, photograph, ring
 from tests.geomocap.test_pipeline_clouds import COARSE, make_capture
@@ -96,7 +101,7 @@ def test_the_report_of_a_run_shows_its_matching(tmp_path: Path) -> None:
         job = Job(run, load_config(overrides=COARSE), executor, capture=capture, fps=capture.fps)
         job.write_record()
         clouds(job)
-    written = {path.name for path in review(run, capture)}
+    written = {path.name for path in review(run, capture, measured=partial(measure_again, run, capture))}
     assert {"matching.png", "cloud_sides.png", "report.html"} <= written
     page = (run.path / "review" / "report.html").read_text()
     assert "Surface measurement" in page and "matched in one search image only" in page

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -15,7 +14,10 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError, RunError
+from geomocap.files.frame_files import ply_count, read_points
 from geomocap.files.run import Run
+from geomocap.model.diagnostics import Diagnostics
+from geomocap.model.rotations import rotation_vectors
 from tests.viz.conftest import LIMBS, Made
 from viz import render_file, review, scene
 from viz.drawing import write_png
@@ -23,7 +25,7 @@ from viz.figures import joint_angles
 from viz.films import best_camera, motion_video, write_video
 from viz.quality_figures import assess, coverage, relative_paths
 from viz.report import Block, Report, Section, render_html, table, video
-from viz.results import Results, ply_count, read_points
+from viz.run_contents import Results
 from viz.scene import stage
 from viz.sheets import overlay, path_sheet
 
@@ -148,10 +150,10 @@ def test_results_read_what_was_written(made: Made) -> None:
     assert {b for b, _, _ in results.skeleton.bones} == {0, 2, 4, 6, 8}
     assert results.counts["voxels"][0] == len(results.voxels(0).indices)
     assert ply_count(made.run.frame_file("bodies", 0)) == len(results.bodies(0).positions)
-    assert set(np.unique(results.bodies(0).bodies)) == set(range(-1, len(LIMBS)))
+    assert set(np.unique(results.bodies(0).body)) == set(range(-1, len(LIMBS)))
     turned = results.skeleton.joint_rotations()
     swing = LIMBS[2][5] * np.sin(2 * np.pi * 5 / 30)
-    np.testing.assert_allclose(turned[5, 1], [np.degrees(swing), 0, 0], atol=1e-6)
+    np.testing.assert_allclose(turned[5, 1], [swing, 0, 0], atol=1e-6)
 
 
 def test_overlay_lies_on_the_photographed_figure(made: Made) -> None:
@@ -210,7 +212,7 @@ def test_relative_paths_of_one_body_have_no_distance(made: Made) -> None:
     results = Results(made.run)
     e = results.ellipsoids
     assert e is not None
-    paths = relative_paths(e, {"seeds": np.array([10]), "threshold": np.array(0.02)})
+    paths = relative_paths(e, Diagnostics(seeds=np.array([10]), threshold=0.02))
     assert paths.seed == 10 and paths.threshold == 0.02  # 0 and 10 are the trunk's, which does not turn
     np.testing.assert_allclose(paths.distance[:, 0], 0, atol=1e-12)
     np.testing.assert_allclose(np.diag(paths.integrals), 0)
@@ -230,7 +232,7 @@ def test_ellipsoids_without_points_are_not_drawn(made: Made, tmp_path: Path) -> 
     assert np.abs(results.any_points(0)).max() < 10
     assert np.abs(scene.ellipsoids(results, 0).vertices).max() < 10
     assert np.abs(scene.paths(results, 1.7).vertices).max() < 10
-    relative = relative_paths(e, {})
+    relative = relative_paths(e, Diagnostics())
     assert np.isnan(relative.distance[:2, 3]).all() and np.isfinite(relative.distance[2:, 3]).all()
     assert np.isfinite(relative.integrals[3, 5]) and np.isnan(relative.integrals[4]).all()
 
@@ -322,19 +324,15 @@ def test_clouds_are_drawn_without_a_word(tmp_path: Path, capfd) -> None:
 def test_points_without_colours_or_bodies(tmp_path: Path) -> None:
     positions = np.array([[0, 0, 0], [1, 2, 3], [np.nan, 0, 0]], np.float32)
     o3d.t.io.write_point_cloud(str(tmp_path / "a.ply"), o3d.t.geometry.PointCloud(o3d.core.Tensor(positions)))
-    points = read_points(tmp_path / "a.ply")
-    assert len(points.positions) == 2 and points.colors.shape == (2, 3)
-    assert points.bodies is None and points.normals is None
+    points = read_points(tmp_path / "a.ply").finite
+    assert len(points.positions) == 2 and points.shown_colors.shape == (2, 3)
+    assert set(points.body) == {-1} and points.normals is None
 
 
-def test_joint_rotations_go_on_past_half_a_turn(made: Made) -> None:
-    skeleton = Results(made.run).skeleton
-    assert skeleton is not None
+def test_joint_rotations_go_on_past_half_a_turn() -> None:
     angles = np.radians(np.arange(0, 300, 30.0))
-    child = Rotation.from_rotvec(np.outer(angles, [0, 0, 1])).as_matrix()
-    rotations = np.stack([np.tile(np.eye(3), (10, 1, 1)), child], axis=1)
-    one = replace(skeleton, joint_bodies=np.array([[0, 1]]), body_rotations=rotations)
-    np.testing.assert_allclose(one.joint_rotations()[:, 0, 2], np.arange(0, 300, 30.0), atol=1e-9)
+    turns = Rotation.from_rotvec(np.outer(angles, [0, 0, 1])).as_matrix()
+    np.testing.assert_allclose(rotation_vectors(turns[:, None])[:, 0, 2], angles, atol=1e-9)
 
 
 def test_arrays_of_all_frames_fit_a_run_that_keeps_some_geometry(made: Made, tmp_path: Path) -> None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from geomocap.files.results import read_diagnostics, write_diagnostics
 from geomocap.files.run import Run
+from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.palette import body_colors
 from tests.viz.conftest import LIMBS, Made
 from viz import review
-from viz.results import Results
+from viz.run_contents import Results
 from viz.scene import stage
 from viz.separation import alternatives_sheet, joints_table
 
@@ -44,9 +47,10 @@ def followed(made: Made, tmp_path: Path) -> Run:
 
 def test_alternatives_show_other_numbers_of_bodies_only(followed: Run) -> None:
     results = Results(followed)
-    one = Results(followed)
-    one.diagnostics["alternative_labels"] = one.diagnostics["alternative_labels"][:1]
-    both, single = (alternatives_sheet(r, stage(r)) for r in (results, one))
+    found = results.diagnostics
+    both = alternatives_sheet(results, stage(results))
+    write_diagnostics(followed, replace(found, alternative_labels=found.alternative_labels[:1]))
+    single = alternatives_sheet(Results(followed), stage(results))
     assert both is not None and single is not None
     assert both.shape[1] > 1.8 * single.shape[1]  # the alternative with as many bodies is not drawn again
     unlike = body_colors(np.array([7]))[0]  # a body that only the finer of the two has
@@ -66,8 +70,9 @@ def test_joints_table_tells_hinges_with_their_axes(followed: Run) -> None:
 
 
 def test_joints_of_a_known_model_have_no_standard_deviations(followed: Run, made: Made) -> None:
-    kinds = {name: Results(followed).diagnostics[name] for name in ("joint_is_hinge", "joint_axes")}
-    followed.write_npz("diagnostics.npz", paths=np.array("model"), fit_distance=np.full(6, 0.01), **kinds)
+    found = read_diagnostics(followed)
+    kinds = Diagnostics("model", joint_is_hinge=found.joint_is_hinge, joint_axes=found.joint_axes)
+    write_diagnostics(followed, replace(kinds, fit_distance=np.full(6, 0.01)))
     block = joints_table(Results(followed))
     assert block is not None and block.rows[2][2:] == ("hinge", "0.00, 0.60, 0.80", "")
     assert "hinge" in review(followed, made.capture, frames=[0])[-1].read_text(encoding="utf-8")

@@ -12,9 +12,9 @@ from geomocap.errors import RunError
 from geomocap.files.run import Run
 from tests.viz.conftest import Made
 from viz import review
-from viz.results import Results
+from viz.run_contents import Results
 from viz.scene import stage
-from viz.track_pictures import filter_sheet, read_tracks, trajectory_sheet, velocity_sheet
+from viz.track_pictures import filter_sheet, trajectory_sheet, velocity_sheet
 
 FPS = 30.0
 RED = np.array([200, 30, 50])
@@ -50,7 +50,7 @@ def reds(image: np.ndarray) -> int:
 
 def test_removed_points_are_red_without_filters_only(made: Made, tracked: Run) -> None:
     results = Results(tracked, made.capture)
-    found = read_tracks(results)
+    found = results.tracks
     assert found is not None
     image = filter_sheet(results, stage(results), found, 4)
     assert image is not None
@@ -61,10 +61,10 @@ def test_removed_points_are_red_without_filters_only(made: Made, tracked: Run) -
 
 def test_speed_is_told_by_colour(made: Made, tracked: Run) -> None:
     results = Results(tracked)
-    found = read_tracks(results)
+    found = results.tracks
     assert found is not None
     slow = velocity_sheet(results, stage(results), found, [3])
-    found.velocities[::2] *= 0.1
+    found.motion.velocities[::2] *= 0.1
     mixed = velocity_sheet(results, stage(results), found, [3])
     assert slow is not None and mixed is not None
     blue = [int(((i[:-40, :, 2].astype(int) - i[:-40, :, 0]) > 80).sum()) for i in (slow, mixed)]
@@ -73,7 +73,7 @@ def test_speed_is_told_by_colour(made: Made, tracked: Run) -> None:
 
 def test_trajectories_without_images_are_drawn_on_white(tracked: Run) -> None:
     results = Results(tracked)
-    found = read_tracks(results)
+    found = results.tracks
     assert found is not None
     image = trajectory_sheet(results, stage(results), found, [1, 5])
     assert image is not None
@@ -89,5 +89,5 @@ def test_report_shows_them(made: Made, tracked: Run) -> None:
 
 def test_a_file_without_velocities_is_refused(tracked: Run) -> None:
     tracked.write_npz("tracks.npz", positions=np.zeros((1, 6, 3)))
-    with pytest.raises(RunError, match="geomocap track"):
-        read_tracks(Results(tracked))
+    with pytest.raises(RunError, match="has no array velocities"):
+        _ = Results(tracked).tracks

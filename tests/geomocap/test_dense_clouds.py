@@ -10,10 +10,10 @@ import pycolmap
 import pytest
 from scipy.spatial import cKDTree
 
-from geomocap.dense import CloudFrame, CloudSettings, cloud_of_frame, match_groups
-from geomocap.dense.dense_settings import GroupSettings, TrustSettings
+from geomocap.dense.dense_frame import CloudFrame, cloud_of_frame
+from geomocap.dense.dense_settings import CloudSettings, GroupSettings, TrustSettings
 from geomocap.dense.match_evidence import MatchEvidence
-from geomocap.dense.match_groups import scene_center
+from geomocap.dense.match_groups import match_groups, scene_center
 from geomocap.dense.search_bounds import box_depth, hull_depth, inside_silhouettes
 from geomocap.errors import CalibrationError, GeometryError
 from geomocap.model.frame_geometry import Voxels

@@ -15,10 +15,11 @@ from geomocap.skeleton.articulated_adjustment import adjust
 from geomocap.skeleton.body_observations import Observations
 from geomocap.skeleton.kinematics import BodyMotion, JointMotion, body_motion, posed, since
 from geomocap.skeleton.motion_smoothness import PosePrior
-from geomocap.subject.model_following import FollowingSettings, follow_model
+from geomocap.subject.following_settings import FollowingSettings
+from geomocap.subject.model_following import follow_model
 from geomocap.subject.pose_search import find_pose
 from geomocap.subject.sequence_paths import attach_paths, turned_by_paths
-from geomocap.subject.subject_model import SubjectModel, read_model, rotation_limits
+from geomocap.subject.subject_model import SubjectModel, read_model, rotation_limits, write_model
 from geomocap.subject.surface_matching import FrameSurface, MatchingScales, ModelSurface, match_surfaces
 
 SPACING = 0.015
@@ -265,7 +266,7 @@ def test_limits_are_those_of_all_takes(model):
 
 def test_stage_follows_the_model_and_says_when_it_fits_poorly(model, tmp_path):
     _, places = sequence_of(model, 3)
-    Run(tmp_path / "first").write_npz("model.npz", **model.arrays())
+    write_model(tmp_path / "first/model.npz", model)
     settings = Config(following=FollowingSettings(rounds=1, steps=3, start_frames=1))
     for name, scale in (("good", 1.0), ("large", 1.6)):
         np.savez(tmp_path / f"{name}.npz", points=scale * places)

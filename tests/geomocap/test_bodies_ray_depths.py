@@ -7,7 +7,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from geomocap.bodies import ray_depths as ray_depths
-from geomocap.bodies.motion_bodies import MotionBodies, MotionBodiesSettings, find_motion_bodies
+from geomocap.bodies.body_settings import MotionBodiesSettings
+from geomocap.bodies.motion_bodies import MotionBodies, find_motion_bodies
 from geomocap.bodies.ray_depths import find_bodies_and_depths, place_samples, settle_depths
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.small_systems import solve_symmetric

@@ -5,7 +5,8 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from geomocap.bodies.motion_bodies import MotionBodiesSettings, find_motion_bodies
+from geomocap.bodies.body_settings import MotionBodiesSettings
+from geomocap.bodies.motion_bodies import find_motion_bodies
 from geomocap.model.hierarchy import Hierarchy
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.rotations import turn_angles
@@ -14,8 +15,9 @@ from geomocap.skeleton.articulated_adjustment import JointPrior, _system, adjust
 from geomocap.skeleton.body_observations import Observations, SkinPoints
 from geomocap.skeleton.kinematics import Linkage, body_motion, joint_motion, moved_by, posed, since
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
+from geomocap.skeleton.motion_skeleton_settings import RefinementSettings
 from geomocap.skeleton.motion_smoothness import Smoothness, accelerations
-from geomocap.skeleton.refinement import RefinementSettings, refine_motion, refine_skeleton
+from geomocap.skeleton.refinement import refine_motion, refine_skeleton
 from geomocap.skeleton.skinning import candidates_near, fit_fractions
 from tests.geomocap.moving_chains import Chain, chain, seen_by_single_cameras
 

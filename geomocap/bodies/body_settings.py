@@ -1,0 +1,82 @@
+"""Settings of the bodies found from motion paths."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from geomocap.settings import Settings
+
+
+class MotionBodiesSettings(Settings):
+    """How rigid bodies are found from motion paths."""
+
+    bodies: int = Field(
+        default=0, ge=0, description="number of bodies; 0: found automatically", json_schema_extra={"flag": "bodies"}
+    )
+    min_turn_deg: float = Field(
+        default=15.0,
+        gt=0,
+        lt=180,
+        description="a body turns at least this much against each neighbour (degrees)",
+        json_schema_extra={"flag": "min-turn"},
+    )
+    part_turn_deg: float = Field(
+        default=12.0,
+        gt=0,
+        lt=180,
+        description="the same where samples move with rigid parts, whose turns are known better (degrees)",
+    )
+    min_excess_deg: float = Field(
+        default=3.5,
+        gt=0,
+        lt=90,
+        description="blends of its neighbours must miss a body's core by at least this, seen from its middle (degrees)",
+    )
+    radius: float = Field(
+        default=0.03,
+        gt=0,
+        lt=0.5,
+        description="surface around a sample that shows how it turns (fraction of the diagonal)",
+    )
+    first_cut_deg: float = Field(
+        default=9.0, gt=0, lt=180, description="groups of samples that turn less differently are the start (degrees)"
+    )
+    min_fraction: float = Field(
+        default=0.01,
+        ge=0,
+        lt=0.5,
+        description="smallest body (fraction of the samples; what one camera alone sees counts two thirds), unless "
+        "two others hang together by it",
+        json_schema_extra={"flag": "min-fraction"},
+    )
+    soft_fraction: float = Field(
+        default=0.18,
+        ge=0,
+        lt=1,
+        description="soft skin turns by a fixed part of what the bodies beside it do, to this fraction of it (0..1); "
+        "0 where samples move with rigid parts",
+    )
+    neighbours: int = Field(default=10, ge=4, description="neighbours of a sample on the surface")
+    max_stretch: float = Field(
+        default=2.0, gt=1, description="neighbours that separate more are none (times the usual distance)"
+    )
+    reach: float = Field(
+        default=0.08, gt=0, lt=1, description="a sample may belong to bodies this near along the surface (diagonals)"
+    )
+    depth_rounds: int = Field(
+        default=2,
+        ge=0,
+        description="times that depths of what single cameras see are found from the bodies, and bodies from these",
+    )
+    blends: bool = Field(
+        default=True,
+        description="samples may follow a blend of two bodies, as soft skin does",
+        json_schema_extra={"flag": "soft-borders"},
+    )
+    blend_penalty: float = Field(
+        default=0.004, ge=0, description="an even blend of two bodies counts as a residual of this (diagonals)"
+    )
+    largest_residual: float = Field(default=0.03, gt=0, description="larger residuals count as this (diagonals)")
+    smoothness: float = Field(
+        default=0.3, ge=0, lt=1, description="weight of its neighbours in the choice of a sample's body (0..1)"
+    )

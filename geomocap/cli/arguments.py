@@ -1,0 +1,34 @@
+"""Arguments and options that commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def _limited(workers: int | None) -> int | None:
+    from geomocap.scheduling import limit_threads
+
+    limit_threads(workers)
+    return workers
+
+
+CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder, with capture.toml.")]
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder; made if it isn't there.")]
+ExistingRun = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of `geomocap run`, `track` or `segment`.")]
+ModelFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--model", metavar="FILE.npz", help="Model of the subject, model.npz of another run: it is followed instead."
+    ),
+]
+Pictures = Annotated[bool, typer.Option(help="Make review pictures and the report.")]
+Workers = Annotated[
+    int | None,
+    typer.Option("--workers", min=1, callback=_limited, help="Threads to use; one for each core if not given."),
+]
+Scheduler = Annotated[
+    str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to map frames on, tcp://host:8786.")
+]

@@ -1,0 +1,126 @@
+"""The commands that are made of stages: each opens folders, makes a job, calls the library and shows progress.
+
+What does the work is imported when a command is called, so that its help comes at once.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from geomocap.cli.arguments import CaptureFolder, ModelFile, Pictures, RunFolder, Scheduler, Workers
+from geomocap.cli.settings_options import with_settings
+from geomocap.config import Config
+
+Fps = Annotated[float, typer.Option("--fps", min=0.001, help="Scans per second.")]
+BODIES = ("segmentation", "skeleton", "nodes", "motion_bodies", "motion_skeleton", "refinement", "following")
+
+
+@with_settings("silhouettes")
+def silhouettes(
+    capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
+) -> None:
+    """Cut the subject out of all images."""
+    from geomocap import pipeline
+    from geomocap.cli.jobs import capture_job
+
+    with capture_job(capture, run, config, workers, scheduler) as job:
+        pipeline.silhouettes(job)
+
+
+@with_settings("silhouettes", "carving")
+def voxels(
+    capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
+) -> None:
+    """Carve the surface voxels of all frames, silhouettes first where they are missing."""
+    from geomocap import pipeline
+    from geomocap.cli.jobs import capture_job
+
+    with capture_job(capture, run, config, workers, scheduler) as job:
+        pipeline.voxels(job)
+
+
+@with_settings("silhouettes", "carving", "cloud")
+def cloud(
+    capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
+) -> None:
+    """Measure the surface by least squares matching: a dense point cloud for each frame."""
+    from geomocap import pipeline
+    from geomocap.cli.jobs import capture_job
+    from geomocap.cli.reports import tell_clouds
+
+    with capture_job(capture, run, config, workers, scheduler) as job:
+        pipeline.clouds(job)
+    tell_clouds(job.run)
+
+
+@with_settings("silhouettes", "carving", "tracking", "filters", "smoothing")
+def track(
+    capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
+) -> None:
+    """Follow points of the surface through all frames: trajectories with velocities and accelerations."""
+    from geomocap import pipeline
+    from geomocap.cli.jobs import capture_job
+
+    with capture_job(capture, run, config, workers, scheduler) as job:
+        pipeline.tracks(job)
+
+
+@with_settings("scans", *BODIES, "export")
+def segment(
+    scans: Annotated[
+        Path, typer.Argument(metavar="SCANS", help="Folder of scans, or one file (PLY PCD OBJ STL GLB NPZ).")
+    ],
+    run: RunFolder,
+    config: Config,
+    fps: Fps = 30.0,
+    model: ModelFile = None,
+    pictures: Pictures = True,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Segment any sequence of scans into rigid bodies, joints and motion; one scan gets its ellipsoids."""
+    from geomocap import pipeline
+    from geomocap.cli.jobs import scans_job
+    from geomocap.cli.reports import review_job, tell_results
+
+    with scans_job(scans, run, fps, config, workers, scheduler, model) as job:
+        key = pipeline.motion_files(job, "scans")
+        if pictures:
+            review_job(job, key)
+    tell_results(run)
+
+
+@with_settings("silhouettes", "carving", "cloud", "tracking", "filters", "smoothing", *BODIES, "export")
+def run(
+    capture: CaptureFolder,
+    run: RunFolder,
+    config: Config,
+    source: Annotated[Literal["voxels", "cloud"], typer.Option("--source", help="Geometry to work from.")] = "voxels",
+    model: ModelFile = None,
+    pictures: Pictures = True,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Do everything: from a capture to bodies, skeleton, motion files and report.
+
+    A run that was stopped goes on where it was; stages whose inputs and settings have not changed are not done again.
+
+    With a model of the subject, saved as model.npz by a run of another sequence, bodies and joints are not looked for:
+    the model is found in this sequence and followed through it.
+
+    Example: `geomocap run CAPTURE RUN --resolution 192 --bodies 15`
+    """
+    from geomocap import pipeline
+    from geomocap.cli.jobs import capture_job
+    from geomocap.cli.reports import review_job, tell_clouds, tell_results
+
+    with capture_job(capture, run, config, workers, scheduler, model) as job:
+        key = pipeline.motion_files(job, source)
+        if pictures:
+            review_job(job, key)
+    if source == "cloud":
+        tell_clouds(job.run)
+    tell_results(run)

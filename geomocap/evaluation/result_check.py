@@ -1,0 +1,154 @@
+"""How good a result is, without any truth: does it explain what every camera saw?
+
+Three questions, each asked of what the others did not use for their answer:
+
+- *Model.* The skinned model, posed by the motion found, is drawn into the cameras. Its outline is compared with the
+  silhouettes (intersection over union). Wrong bodies, joints or turns put limbs where no silhouette is.
+- *Cameras.* Each camera in turn is left out; the visual hull of the others is drawn into it. Calibration,
+  synchronization and silhouettes that fit together give nearly the silhouette; a camera that contradicts the others
+  stands out. (The hull is always a little larger than the subject, the more so the fewer cameras there are.)
+- *Paths.* How far tracked surface points stay from where their bodies carry them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import cv2
+import numpy as np
+import open3d as o3d
+
+from geomocap.carving.carving_settings import HullSettings
+from geomocap.carving.hull import hull
+from geomocap.carving.silhouette_views import PinholeViews, Undistortion
+from geomocap.carving.visibility import SurfaceVoxels, depth_buffers
+from geomocap.carving.voxel_grid import Grid
+from geomocap.files.capture import Capture
+from geomocap.files.results import read_diagnostics, read_silhouette, read_skeleton
+from geomocap.files.run import Run
+from geomocap.model.rig import Rig
+from geomocap.model.self_check import SelfCheck
+from geomocap.skeleton.kinematics import BodyMotion
+from geomocap.subject.model_mesh import ModelMesh, model_mesh
+from geomocap.subject.subject_model import MODEL_FILE, read_model
+
+FRAMES = 6  # evenly spread
+MESH_TRIANGLES = 20000
+LONGEST_SIDE = 320  # pixels in which outlines are compared
+CELLS = 96  # along the longest side of the hull that is drawn into a camera left out
+_AROUND = 0.15  # by which the volume of the left-out hull is larger than the subject
+_ALL_FACES = 63
+
+
+def check_run(run: Run, capture: Capture) -> SelfCheck | None:
+    """Compare a run's motion with its silhouettes; None if it has no model, skeleton or silhouettes.
+
+    Parameters
+    ----------
+    run : Run
+    capture : Capture
+        What it was made from.
+    """
+    needed = (MODEL_FILE, "skeleton.npz", "silhouettes")
+    if not capture.is_calibrated or not all((run.path / name).exists() for name in needed):
+        return None
+    skeleton, mesh = read_skeleton(run), model_mesh(read_model(run.path / MODEL_FILE), MESH_TRIANGLES)
+    undistortion = Undistortion.of(capture.rig)
+    chosen = np.unique(np.linspace(0, len(skeleton.body_rotations) - 1, FRAMES).round().astype(int))
+
+    def views(frame: int) -> PinholeViews:
+        return undistortion.views([read_silhouette(run, camera, frame) for camera in capture.cameras])
+
+    start = skeleton.body_positions[0]
+    shifts = skeleton.body_positions - np.einsum("tbij,bj->tbi", skeleton.body_rotations, start)
+    motion = BodyMotion(skeleton.body_rotations, shifts)
+    residual = float("nan")
+    if (run.path / "diagnostics.npz").exists():
+        found = read_diagnostics(run).sample_residuals
+        if found is not None and len(found):
+            residual = float(np.median(found)) / float(np.linalg.norm(np.ptp(mesh.surface.vertices, axis=0)))
+    return check_result(capture.cameras, chosen.tolist(), views, capture.rig.undistorted(), mesh, motion, residual)
+
+
+def check_result(
+    cameras: Sequence[str],
+    frames: Sequence[int],
+    views: Callable[[int], PinholeViews],
+    rig: Rig,
+    mesh: ModelMesh,
+    motion: BodyMotion,
+    residual: float = np.nan,
+) -> SelfCheck:
+    """Compare a motion with the silhouettes it was found from.
+
+    Parameters
+    ----------
+    cameras : sequence of C str
+    frames : sequence of F int
+        Which to look at.
+    views : callable
+        `views(frame)`: undistorted silhouettes of all cameras.
+    rig : Rig
+        Undistorted cameras of these views.
+    mesh : ModelMesh
+        The subject's surface in the pose of frame 0.
+    motion : BodyMotion
+        From frame 0 on.
+    residual : float
+        See `SelfCheck`.
+    """
+    model = np.full((len(cameras), len(frames)), np.nan)
+    left_out = np.full_like(model, np.nan)
+    for column, frame in enumerate(frames):
+        seen = views(frame)
+        placed = motion.part(slice(frame, frame + 1)).carry(mesh.skin.rest, mesh.skin.bodies, mesh.skin.fractions)[0]
+        scene = o3d.t.geometry.RaycastingScene()
+        corners, triangles = placed.astype(np.float32), mesh.surface.triangles.astype(np.uint32)
+        scene.add_triangles(o3d.core.Tensor.from_numpy(corners), o3d.core.Tensor.from_numpy(triangles))
+        for c in np.flatnonzero(~seen.blind()):
+            model[c, column] = _drawn_overlap(scene, rig, seen, int(c))
+        left_out[:, column] = _left_out_overlaps(seen, placed)
+    return SelfCheck(tuple(cameras), np.asarray(frames), model, left_out, float(residual))
+
+
+def _drawn_overlap(scene: o3d.t.geometry.RaycastingScene, rig: Rig, views: PinholeViews, camera: int) -> float:
+    """Overlap of what is drawn into a camera with its silhouette."""
+    width, height = (int(n) for n in rig.sizes[camera])
+    shrunk = min(1.0, LONGEST_SIDE / max(width, height))
+    size = max(1, round(shrunk * width)), max(1, round(shrunk * height))
+    K = rig.cameras[camera].calibration_matrix()
+    K = np.diag([size[0] / width, size[1] / height, 1.0]) @ K
+    pose = np.vstack([rig.cam_from_world[camera], [0, 0, 0, 1]])
+    rays = scene.create_rays_pinhole(o3d.core.Tensor.from_numpy(K), o3d.core.Tensor.from_numpy(pose), *size)
+    drawn = np.isfinite(scene.cast_rays(rays)["t_hit"].numpy())
+    mask = _shrunk(views.masks[camera, :height, :width], size)
+    return _overlap(drawn & _shrunk(views.valid[camera, :height, :width], size), mask)
+
+
+def _left_out_overlaps(views: PinholeViews, subject: np.ndarray) -> np.ndarray:
+    """Overlap of each camera's silhouette with the hull of all other cameras, (C,) float."""
+    result = np.full(len(views), np.nan)
+    low, high = subject.min(axis=0), subject.max(axis=0)
+    margin = _AROUND * float((high - low).max())
+    grid = Grid.of_box(low - margin, high + margin, resolution=CELLS)
+    blind = views.blind()
+    for c in range(len(views)) if len(views) > 2 else ():
+        if blind[c]:
+            continue
+        surface = hull(views.without(c), grid, HullSettings()).surface_indices()
+        one = PinholeViews(
+            views.names[c : c + 1], views.projections[c : c + 1], views.masks[c : c + 1], views.valid[c : c + 1]
+        )
+        faces = np.full(len(surface), _ALL_FACES, np.uint8)
+        drawn = np.isfinite(depth_buffers(one, grid, SurfaceVoxels(surface.astype(np.int32), faces))[0])
+        result[c] = _overlap(drawn & (one.valid[0] > 0), one.masks[0] > 0)
+    return result
+
+
+def _shrunk(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    return cv2.resize((mask > 0).astype(np.float32), size, interpolation=cv2.INTER_AREA) >= 0.5
+
+
+def _overlap(a: np.ndarray, b: np.ndarray) -> float:
+    either = np.count_nonzero(a | b)
+    return np.count_nonzero(a & b) / either if either else float("nan")

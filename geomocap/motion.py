@@ -1,0 +1,212 @@
+"""The default method on arrays: tracks or scans in; bodies, joints and skeleton out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from geomocap.bodies.motion_bodies import MotionBodies, MotionBodiesSettings
+from geomocap.bodies.point_labels import label_points
+from geomocap.bodies.ray_depths import find_bodies_and_depths
+from geomocap.errors import GeometryError
+from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.skeleton import Skeleton
+from geomocap.nodes.node_settings import NodeTrackingSettings
+from geomocap.nodes.node_tracking import track_nodes
+from geomocap.progress import Progress, silent
+from geomocap.settings import Settings
+from geomocap.skeleton.common_points import CommonPoint
+from geomocap.skeleton.motion_skeleton import MotionSkeleton, MotionSkeletonSettings, find_motion_skeleton
+from geomocap.skeleton.refinement import RefinementSettings, refine_skeleton
+from geomocap.trajectories.selection import spread_out
+
+SAMPLES = 2000  # motion paths that bodies are found from: more cost time and find the same
+_UNSURE_DEG = 30.0  # 3 to 8 with eight cameras; with four that show the bodies 12, in a cluttered room 29
+_LABEL_FRAMES = 12  # frames in which tracks that were not sampled are compared with those that were
+
+
+class MotionSettings(Settings):
+    """How motion is found; each part is a table of the settings file."""
+
+    bodies: MotionBodiesSettings = Field(MotionBodiesSettings(), description="bodies from motion paths")
+    skeleton: MotionSkeletonSettings = Field(MotionSkeletonSettings(), description="their joints")
+    refinement: RefinementSettings = Field(RefinementSettings(), description="refinement of their motion")
+    nodes: NodeTrackingSettings = Field(NodeTrackingSettings(), description="following scans without order")
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Rigid bodies, how they move, and the skeleton that connects them.
+
+    Attributes
+    ----------
+    bodies : MotionBodies
+        B bodies of S samples over T frames: labels, skin weights, motion.
+    connected : MotionSkeleton
+        The skeleton and what is known of its joints.
+    paths : MotionPaths
+        What the samples did.
+    labels : (N,) int32
+        Body of each track that was given; -1: none. Of scans, of each sample.
+    """
+
+    bodies: MotionBodies
+    connected: MotionSkeleton
+    paths: MotionPaths
+    labels: np.ndarray
+
+    @property
+    def body_count(self) -> int:
+        """Number of bodies B."""
+        return self.bodies.body_count
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """Joints, hierarchy and motion: `joint_positions` (T, J, 3) m, `joint_bodies` (J, 2), `body_rotations` …."""
+        return self.connected.skeleton
+
+    @property
+    def joints(self) -> tuple[CommonPoint, ...]:
+        """What is known of each joint of the skeleton: hinge or ball, axis, standard deviation (m)."""
+        return self.connected.joints
+
+    @property
+    def joint_is_hinge(self) -> np.ndarray:
+        """Joints that turn about one axis only, (J,) bool."""
+        return np.array([joint.hinge for joint in self.joints], dtype=bool)
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Skin weights of the samples, (S, B) float; rows sum to 1."""
+        return self.bodies.weights
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What makes the result doubtful, in words."""
+        return unsure_turns(self.bodies)
+
+    def label(self, frame: int, points: np.ndarray) -> np.ndarray:
+        """Bodies (M,) int32 of any points (M, 3), metres, of the surface in a frame."""
+        return label_points(self.bodies, self.paths, frame, points)
+
+
+def unsure_turns(bodies: MotionBodies) -> tuple[str, ...]:
+    """Say so if what lies side by side turns too differently for bodies and joints to be trusted."""
+    unevenness = float(np.rad2deg(bodies.unevenness))
+    if unevenness <= _UNSURE_DEG:
+        return ()
+    return (
+        f"neighbouring samples of the surface turn by {unevenness:.0f}° against each other (median; at most "
+        f"{_UNSURE_DEG:.0f}° expected): number of bodies, joints and skeleton are not to be trusted; use more "
+        "cameras, more texture or more frames a second",
+    )
+
+
+def find_motion(
+    tracks: np.ndarray | MotionPaths | Sequence[np.ndarray],
+    *,
+    fps: float,
+    sigma: np.ndarray | None = None,
+    bodies: int = 0,
+    settings: MotionSettings | None = None,
+    progress: Progress = silent,
+    executor: Executor | None = None,
+) -> Motion:
+    """Find the rigid bodies that move a surface, their joints, and their motion.
+
+    The default method of `geomocap run`, on arrays: bodies by how the surface turns (`bodies`), joints as the points
+    that two bodies' motions have in common (`skeleton`), all refined together over all frames. Deterministic.
+
+    Parameters
+    ----------
+    tracks : (N, T, 3) float, or MotionPaths, or sequence of T arrays (M, 3)
+        Metres, world. An array holds tracks: the same surface points in all frames, NaN where unseen. A sequence of
+        arrays holds scans: points of the surface in any order and number, anew in each frame.
+    fps : float
+        Frames per second.
+    sigma : (N,) or (N, T) float, optional
+        Standard deviation of the tracks' positions, metres.
+    bodies : int
+        Their number; 0: found.
+    settings : MotionSettings, optional
+    progress : Progress, optional
+        Called with (stage, done, of).
+    executor : Executor, optional
+        Frames of scans are mapped with it.
+
+    Returns
+    -------
+    Motion
+
+    Raises
+    ------
+    GeometryError
+        If the arrays have another shape, or there are too few tracks or frames.
+
+    Examples
+    --------
+    >>> motion = geomocap.find_motion(tracks, fps=30)  # doctest: +SKIP
+    >>> motion.skeleton.joint_positions.shape          # doctest: +SKIP
+    (60, 15, 3)
+    """
+    settings = settings or MotionSettings()
+    if bodies:
+        settings = settings.model_copy(update={"bodies": settings.bodies.model_copy(update={"bodies": bodies})})
+    given = None
+    if isinstance(tracks, MotionPaths):
+        paths = tracks
+    elif isinstance(tracks, np.ndarray):
+        given, (paths, samples) = tracks, _sampled(tracks, sigma)
+    else:
+        paths = _followed(tracks, settings.nodes, progress, executor)
+    found, paths = find_bodies_and_depths(paths, settings.bodies, progress)
+    progress("skeleton", 0, 2)
+    connected = find_motion_skeleton(found, fps, settings.skeleton)
+    progress("skeleton", 1, 2)
+    connected, found = refine_skeleton(connected, found, paths, settings.refinement)
+    progress("skeleton", 2, 2)
+    labels = found.label if given is None else _labels_of_all(given, samples, found, paths)
+    return Motion(found, connected, paths, labels)
+
+
+def _sampled(tracks: np.ndarray, sigma: np.ndarray | None) -> tuple[MotionPaths, np.ndarray]:
+    """Motion paths of long tracks, evenly over the surface, and which tracks these are, (S,) int."""
+    if tracks.ndim != 3 or tracks.shape[2] != 3:
+        raise GeometryError(f"tracks have shape {tracks.shape}, expected (N, T, 3): N points in T frames, metres")
+    samples = spread_out(tracks, SAMPLES)
+    if sigma is not None:
+        sigma = np.asarray(sigma, float)
+        if sigma.shape not in (tracks.shape[:1], tracks.shape[:2]):
+            raise GeometryError(f"sigma has shape {sigma.shape}, expected {tracks.shape[:1]} or {tracks.shape[:2]}")
+        sigma = sigma[samples]
+    return MotionPaths(np.asarray(tracks[samples], float), sigma=sigma), samples
+
+
+def _followed(
+    scans: Sequence[np.ndarray], settings: NodeTrackingSettings, progress: Progress, executor: Executor | None
+) -> MotionPaths:
+    """Motion paths of nodes that are followed through scans."""
+    points = [np.asarray(scan, float) for scan in scans]
+    for frame, scan in enumerate(points):
+        if scan.ndim != 2 or scan.shape[1] != 3:
+            raise GeometryError(f"scan of frame {frame} has shape {scan.shape}, expected (M, 3), metres")
+    points = [scan[np.isfinite(scan).all(axis=1)] for scan in points]
+    nodes = track_nodes(points.__getitem__, len(points), settings, progress=progress, executor=executor)
+    return nodes.motion_paths()
+
+
+def _labels_of_all(tracks: np.ndarray, samples: np.ndarray, bodies: MotionBodies, paths: MotionPaths) -> np.ndarray:
+    """Bodies of all tracks, (N,) int32: of a sample its own, of another one by where it lies in some frame."""
+    labels = np.full(len(tracks), -1, np.int32)
+    seen = np.isfinite(tracks).all(axis=2)
+    frames = np.unique(np.linspace(0, tracks.shape[1] - 1, _LABEL_FRAMES).round().astype(int))
+    for frame in (*frames, *np.setdiff1d(np.arange(tracks.shape[1]), frames)):
+        some = np.flatnonzero(seen[:, frame] & (labels < 0))
+        if len(some):
+            labels[some] = label_points(bodies, paths, int(frame), tracks[some, frame])
+    labels[samples] = bodies.label
+    return labels

@@ -1,0 +1,63 @@
+"""Settings of joints found between bodies, and of the refinement of their motion."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from geomocap.settings import Settings
+
+
+class MotionSkeletonSettings(Settings):
+    """How joints are found between bodies, and how these are connected."""
+
+    interface_prior: float = Field(
+        default=0.005,
+        gt=0,
+        description="least weight of the place where bodies touch (frames in which they turn by a radian)",
+    )
+    interface_weight: float = Field(
+        default=0.05, ge=0, description="tree: weight of a joint's distance from where its bodies touch (no unit)"
+    )
+    gap_weight: float = Field(default=0.05, ge=0, description="tree: weight of the bodies' distance (no unit)")
+    contact_weight: float = Field(
+        default=0.01, ge=0, description="tree: cost of bodies without common border (diagonals)"
+    )
+    largest_gap: float = Field(default=0.1, gt=0, description="bodies farther apart are not connected (diagonals)")
+
+
+class RefinementSettings(Settings):
+    """How the motion of connected bodies is refined over all frames."""
+
+    rounds: int = Field(
+        default=3,
+        ge=0,
+        description="rounds of skin weights, shape, and motion with joints; 0: no refinement",
+        json_schema_extra={"flag": "refinement"},
+    )
+    steps: int = Field(default=4, ge=1, description="steps of each adjustment of motion and joints")
+    independence: float = Field(
+        default=0.3, gt=0, le=1, description="fraction of the observations that err independently of each other (0..1)"
+    )
+    noise: float = Field(
+        default=2e-4, gt=0, description="least standard deviation of how a sample follows its bodies (diagonals)"
+    )
+    joint_sigma: float = Field(
+        default=2e-3,
+        gt=0,
+        description="standard deviation of the joints found before, against all observations (diagonals)",
+    )
+    least_slip: float = Field(
+        default=3e-4, gt=0, description="least standard deviation of how far a joint's bodies part (diagonals)"
+    )
+    blend_sigma: float = Field(
+        default=1e-3, gt=0, description="misfit that is worth a change of the skin weights by one (diagonals)"
+    )
+    least_turn_deg: float = Field(
+        default=0.3, gt=0, description="least scale of the turning accelerations (degrees/frame²)"
+    )
+    least_shift: float = Field(
+        default=5e-4, gt=0, description="least scale of the root's accelerations (diagonals/frame²)"
+    )
+    cutoff: float = Field(
+        default=3.0, gt=0, description="residuals and accelerations beyond count less (standard deviations)"
+    )

@@ -1,0 +1,82 @@
+"""The public functions of values: motion, volumes and clouds without a run folder."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+import geomocap
+from geomocap.carving.carving_settings import CarvingSettings
+from geomocap.errors import CaptureError, GeometryError
+from tests.geomocap.ball import RADIUS, Texture, off_surface, photograph, ring
+from tests.geomocap.moving_chains import chain, same_partition
+
+
+@pytest.fixture(scope="module")
+def three():
+    return chain(3)
+
+
+def test_tracks_with_gaps_give_bodies_joints_and_labels_of_every_track(three):
+    tracks = three.positions.copy()
+    tracks[::7, :5] = np.nan  # unseen in the first frames
+    tracks[3] = np.nan  # never seen
+    motion = geomocap.find_motion(tracks, fps=30)
+    assert motion.body_count == 3 and motion.skeleton.joint_positions.shape == (tracks.shape[1], 2, 3)
+    assert motion.labels[3] == -1
+    seen = np.isfinite(tracks).all(axis=2).any(axis=1)
+    assert same_partition(motion.labels[seen], three.body[seen])
+    assert motion.warnings == ()
+
+
+def test_the_number_of_bodies_can_be_given(three):
+    assert geomocap.find_motion(three.positions, fps=30, bodies=2).body_count == 2
+
+
+def test_results_repeat_bit_for_bit(three):
+    first, second = (geomocap.find_motion(three.positions, fps=30) for _ in range(2))
+    assert_array_equal(first.skeleton.joint_positions, second.skeleton.joint_positions)
+    assert_array_equal(first.weights, second.weights)
+
+
+@pytest.mark.parametrize("wrong", [np.zeros((5, 3)), [np.zeros((4, 2))]])
+def test_arrays_of_another_shape_are_refused_in_one_line(wrong):
+    with pytest.raises(GeometryError, match="shape"):
+        geomocap.find_motion(wrong, fps=30)
+
+
+def test_standard_deviations_of_another_shape_are_refused(three):
+    with pytest.raises(GeometryError, match="sigma"):
+        geomocap.find_motion(three.positions, fps=30, sigma=np.ones(2))
+
+
+def test_importing_the_library_loads_nothing_heavy():
+    code = "import sys, geomocap; print([m for m in ('numba', 'open3d', 'scipy', 'pycolmap') if m in sys.modules])"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("name", geomocap.__all__)
+def test_every_public_name_is_there_and_documented(name):
+    assert name in dir(geomocap)
+    assert name == "__version__" or getattr(geomocap, name).__doc__
+
+
+def test_one_frame_of_a_ball_is_carved_and_measured():
+    rig = ring(8, 360.0)
+    images, masks = photograph(rig, Texture.random())
+    settings = CarvingSettings(resolution=64)
+    voxels = geomocap.carve(masks, rig, images=images, settings=settings)
+    # A hull stands off between its cameras' rays: of a ring of eight, by less than a fifth of the radius
+    assert off_surface(voxels.points).mean() < 0.2 * RADIUS and len(voxels.colors) == len(voxels.points)
+    found = geomocap.measure_cloud(images, rig, masks=masks, hull=voxels)
+    assert np.median(off_surface(found.points.positions)) < 1e-3  # metres; 0.2 pixels
+
+
+def test_a_capture_that_is_none_is_refused_in_one_line(tmp_path):
+    with pytest.raises(CaptureError, match=r"capture\.toml"):
+        geomocap.open_capture(tmp_path)
