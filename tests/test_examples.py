@@ -77,6 +77,6 @@ def test_a_calibration_by_bar(tmp_path, monkeypatch, capsys):
     told = capsys.readouterr().out
     assert "bar ends are known to" in told and told.count("camera ") >= 4
     found, true = (read_rig(tmp_path / folder / "sparse").centers for folder in ("capture", "truth"))
-    # the world's frame is free: distances between cameras are compared, to a tenth of a per cent (they are right to 0.014 %)
+    # the world's frame is free: distances between cameras are compared (they are right to 0.014 %)
     apart = [np.linalg.norm(c[:, None] - c[None], axis=2)[np.triu_indices(4, 1)] for c in (found, true)]
     np.testing.assert_allclose(apart[0], apart[1], rtol=1e-3)
