@@ -12,6 +12,7 @@ import trimesh
 from geomocap.errors import GeometryError
 from geomocap.files.frame_files import read_voxels
 from geomocap.files.open3d_geometry import check_ply, read_by_open3d
+from geomocap.files.ragged_arrays import spread_over_frames
 
 MESH_ENDINGS = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 CLOUD_ENDINGS = (".ply", ".pcd", ".xyz", ".pts")
@@ -140,9 +141,12 @@ def read_array(path: Path) -> np.ndarray:
                         f"it has {', '.join(data.files)}"
                     )
                 array = data[name]
-                if _TRACKS <= set(data.files) and array.ndim == 3:
-                    array = array.swapaxes(0, 1)
-    except (OSError, ValueError, EOFError) as error:
+                if _TRACKS <= set(data.files):
+                    if str(data["layout"] if "layout" in data.files else "") == "ragged":
+                        array = spread_over_frames(array, data["first"], data["start"], int(data["n_frames"]))
+                    if array.ndim == 3:
+                        array = array.swapaxes(0, 1)
+    except (OSError, ValueError, KeyError, IndexError, EOFError) as error:
         raise GeometryError(f"{path}: can't be read as plain arrays ({error})") from None
     if array.ndim not in (2, 3) or array.shape[-1] != 3 or array.dtype.kind not in "fiu":
         raise GeometryError(

@@ -8,6 +8,7 @@ import numpy as np
 
 from geomocap.errors import GeometryError, RunError
 from geomocap.files.npz import read_npz, write_npz
+from geomocap.files.ragged_arrays import spread_over_frames
 from geomocap.files.run import Run
 from geomocap.model.trajectories import REASONS, PathDerivatives, Tracks, Trajectories
 
@@ -75,20 +76,8 @@ def _arrays(run: Run, names: tuple[str, ...], needed: tuple[str, ...] = ("positi
 
 def _dense(found: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Give trajectories that stand one after the other all their frames."""
-    lengths = np.diff(found["first"])
-    frames = int(found["n_frames"])
-    who = np.repeat(np.arange(len(lengths)), lengths)
-    when = found["start"][who] + np.arange(len(who)) - found["first"][:-1][who]
-    if len(who) and not 0 <= when.min() <= when.max() < frames:
-        raise ValueError(f"trajectories begin or end beyond frames 0 to {frames - 1}")
-    dense = {}
-    for name in _BY_FRAME:
-        if name in found:
-            values = found[name]
-            shape = (len(lengths), frames, *values.shape[1:])
-            dense[name] = np.zeros(shape, values.dtype) if name in _COUNTED else np.full(shape, np.nan, values.dtype)
-            dense[name][who, when] = values
-    return dense
+    layout = found["first"], found["start"], int(found["n_frames"])
+    return {name: spread_over_frames(found[name], *layout, name in _COUNTED) for name in _BY_FRAME if name in found}
 
 
 def _trajectories(run: Run, found: dict[str, np.ndarray]) -> Trajectories:

@@ -18,6 +18,7 @@ from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, body_
 MODEL_FILE = "model.npz"
 KIND = "geomocap subject model"
 VERSION = 1
+_BEFORE = {"skin_shares": "skin_weights", "extent": "diagonal"}  # arrays as older versions call them
 
 
 @dataclass(frozen=True)
@@ -201,6 +202,7 @@ def read_model(path: Path) -> SubjectModel:
         raise GeometryError(f"{path}: no subject model; expected a run's model.npz")
     if arrays.get("version") != VERSION:
         raise GeometryError(f"{path}: model of version {arrays.get('version')}, expected {VERSION}; make it anew")
+    arrays |= {now: arrays[before] for before, now in _BEFORE.items() if before in arrays}
     names = list(SubjectModel.__dataclass_fields__)
     missing = [name for name in names if name not in arrays]
     if missing:

@@ -126,3 +126,14 @@ def test_too_few_points_to_tell_bodies_by(tmp_path):
         job = Job(Run(tmp_path / "run"), config, executor, scans=scans)
         with pytest.raises(GeometryError, match="motion paths: 5 samples; at least 20 are needed"):
             segment(job, "scans")
+
+
+def test_tracks_one_after_the_other_are_read_as_scans(tmp_path):
+    file = tmp_path / "tracks.npz"
+    points = np.arange(15.0).reshape(5, 3)
+    layout = {"first": np.array([0, 3, 5]), "start": np.array([0, 2]), "end": np.array([3, 4]), "n_frames": 4}
+    np.savez(file, layout="ragged", positions=points, **layout)
+    scans = open_scans(file, ScanSettings(spacing=0.1))
+    assert len(scans) == 4 and scans.tracked
+    np.testing.assert_array_equal(scans.surface(2).points, [points[2], points[3]])
+    np.testing.assert_array_equal(scans.points(3), [points[4]])

@@ -1,0 +1,39 @@
+"""Trajectories that stand one after the other in a file, each from its start to its end."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def spread_over_frames(
+    values: np.ndarray, first: np.ndarray, start: np.ndarray, frames: int, counted: bool = False
+) -> np.ndarray:
+    """Give each trajectory all frames, (N, T, …).
+
+    Parameters
+    ----------
+    values : (M, …)
+        One trajectory after the other.
+    first : (N + 1,) int
+        Where each begins in `values`.
+    start : (N,) int
+        Frame in which each begins.
+    frames : int
+        Number of frames T.
+    counted : bool
+        What is not there is 0 instead of NaN.
+
+    Raises
+    ------
+    ValueError
+        If a trajectory leaves the frames.
+    """
+    lengths = np.diff(first)
+    who = np.repeat(np.arange(len(lengths)), lengths)
+    when = start[who] + np.arange(len(who)) - first[:-1][who]
+    if len(who) and not 0 <= when.min() <= when.max() < frames:
+        raise ValueError(f"trajectories begin or end beyond frames 0 to {frames - 1}")
+    shape = (len(lengths), frames, *values.shape[1:])
+    result = np.zeros(shape, values.dtype) if counted else np.full(shape, np.nan, values.dtype)
+    result[who, when] = values
+    return result
