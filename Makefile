@@ -36,6 +36,7 @@ bench: .stamps/dev
 
 # The pages, into site/: open site/index.html (the search wants a server: python -m http.server -d site).
 docs: .stamps/dev
+	$(BIN)/python -m tools.settings_page
 	$(BIN)/python -m tools.results_page
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 

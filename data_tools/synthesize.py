@@ -39,7 +39,7 @@ class SynthesisSettings(Settings):
     frames: int = Field(60, ge=1, description="number of frames")
     start: float = Field(0.0, ge=0, description="time in the clip at which the capture begins (s)")
     subject_height: float | None = Field(
-        None, gt=0, description="vertical diagonal of the subject at the clip's begin (m); the file's own if not given"
+        None, gt=0, description="height of the subject at the clip's begin (m); the file's own if not given"
     )
     arc_deg: float = Field(360.0, gt=0, le=360, description="arc that the cameras stand on (degrees)")
     hfov_deg: float = Field(45.0, gt=5, lt=120, description="angle of view along the longer image side (degrees)")
@@ -62,7 +62,7 @@ class SynthesisSettings(Settings):
     bar_length: float | None = Field(
         None,
         gt=0,
-        description="distance of the bar's targets (m); a third of the volume's largest diagonal if not given",
+        description="distance of the bar's targets (m); a third of the volume's longest side if not given",
     )
     withhold_calibration: bool = Field(False, description="write no sparse/ into the capture (the truth has it)")
     video: bool = Field(False, description="write `videos/<camera>.mp4` (H.264, lossy) instead of PNG images")

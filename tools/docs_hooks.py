@@ -21,9 +21,6 @@ ROOT = Path(__file__).parent.parent
 OTHERS = "api/others.md"
 _EQUATION = re.compile(r'<(div|span) class="arithmatex">\\[\[(](.*?)\\[\])]</\1>', re.DOTALL)
 _NAME = re.compile(r"(?<!\[)`(geomocap\.(\w+)[\w.]*)`")
-_GENERATED = {
-    "settings.md": "# Settings\n\n`geomocap run --help` lists the settings with units, meanings and defaults.\n",
-}
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
@@ -34,10 +31,9 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that are made from sources: the rooms, the changelog; generated ones that aren't there yet."""
+    """Add the pages that are made from sources: the rooms and the changelog."""
     made = {f"api/{room}.md": room_page(room) for room in rooms()} | {OTHERS: others_page()}
     made["changelog.md"] = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").replace("](docs/", "](")
-    made |= {name: text for name, text in _GENERATED.items() if files.get_file_from_path(name) is None}
     for name, text in made.items():
         files.append(File.generated(config, name, content=text))
     return files

@@ -181,7 +181,7 @@ def grid_step(groups: MatchGroups, group: MatchGroup, settings: CloudSettings) -
 
 @dataclass(frozen=True)
 class Scene:
-    """What all templates of a frame fraction.
+    """What all templates of a frame share.
 
     Attributes
     ----------
