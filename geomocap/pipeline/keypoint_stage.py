@@ -134,7 +134,7 @@ def run_trajectories(run: Run) -> Trajectories:
     """
     if (run.path / "diagnostics.npz").is_file():
         found = run.read_npz("diagnostics.npz")
-        if "sample_positions" in found and str(found.get("paths", "")) in ("nodes", "both", "points"):
+        if "sample_positions" in found and str(found.get("paths", "")) in ("nodes", "both", "pieces", "points"):
             return trajectories_of({"positions": found["sample_positions"]}, run.path / "diagnostics.npz")
     if not (run.path / "tracks.npz").exists():
         raise RunError(
