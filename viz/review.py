@@ -43,6 +43,7 @@ _FOLLOWED = {
     "points": "points that the scans have in common",
     "nodes": "nodes of a deformable surface",
     "both": "nodes of a deformable surface, held by patches of the images",
+    "pieces": "patches of the images, and nodes of a deformable surface where these leave it uncovered",
     "ellipsoids": "ellipsoids",
 }
 

@@ -272,7 +272,7 @@ def read_followed(run: Run) -> Trajectories:
         If it has neither.
     """
     found = read_diagnostics(run)
-    if found.sample_positions is not None and found.paths in ("nodes", "both", "points"):
+    if found.sample_positions is not None and found.paths in ("nodes", "both", "pieces", "points"):
         with _named(run.path / DIAGNOSTICS):
             return Trajectories.of_positions(found.sample_positions)
     if not run.has(TRACKS):

@@ -14,9 +14,12 @@ in space that a camera sees now is the one vector g with these slopes that is or
 
 The Jacobian is thus formed once an alignment and not once an iteration (inverse composition: Baker, Matthews 2004,
 "Lucas–Kanade 20 years on"), and an iteration costs one interpolation a sample. Offset and gain are projected out of J.
-Cameras are weighted with their own residuals; standard deviations come from the inverse of the normal matrix. What
-residuals have beyond the noise of the images is what the model of a rigid piece of surface with a fixed texture misses,
-and that goes together over much of a patch: it counts as if only a few of the samples were independent.
+Cameras are weighted with their own residuals, and with how well the place was known at which their templates were
+taken: the variance of the place by one camera is that of its image, 2 / (w tr JₛᵀJₛ) along the surface, and that of
+its template's. So first templates hold a patch while others come and go. Standard deviations come from the inverse of
+the normal matrix. What residuals have beyond the noise of the images is what the model of a rigid piece of surface with
+a fixed texture misses, and that goes together over much of a patch: it counts as if only a few of the samples were
+independent.
 """
 
 from __future__ import annotations
@@ -30,7 +33,7 @@ from geomocap.model.small_systems import cholesky, inverse_diagonal, solve
 from geomocap.patches.patch_samples import choose_samples, compare, sum_of_products
 from geomocap.patches.patch_templates import local_camera, set_place, turn_by
 
-_FLOOR = 2.0  # noise of an image that even a perfect fit is granted, grey levels
+_FLOOR = 1.0  # noise of an image that even a perfect fit is granted, grey levels
 COHERENT = 0.15  # fraction of the samples over which residuals beyond that go together
 _TOGETHER = 32  # patches of a thread before it asks for more
 _GAIN = 3.0  # most contrast that an image may lose or win against the template
@@ -46,6 +49,7 @@ def _align_some(
     rows,
     templates,
     usable,
+    doubt,
     use,
     images,
     level,
@@ -143,6 +147,10 @@ def _align_some(
                 residual = max(variance_t[c] * (1 - now[c] * abs(now[c])), 0.0)
                 misfit = residual * counts[c] / max(counts[c] - 8, 1)
                 weights[c] = 1 / (misfit * max(COHERENT * counts[c], 1.0) + _FLOOR**2)
+                if iterations > 0:
+                    # no camera says more of the place than was known when its template was taken
+                    along = 0.5 * weights[c] * (H[c, 0, 0] + H[c, 1, 1] + H[c, 2, 2])
+                    weights[c] /= 1 + along * doubt[n, c] ** 2
                 top = max(top, now[c])
             for c in range(C):
                 if counts[c] == 0:
@@ -213,6 +221,7 @@ def align_patches(
     rows,
     templates,
     usable,
+    doubt,
     use,
     images,
     level,
@@ -245,6 +254,8 @@ def align_patches(
         Where the patches have their templates.
     templates : (R, C, L, M, 3) float32
     usable : (R, C, M) uint8
+    doubt : (N, C) float
+        Standard deviation of the place at which each template was taken, metres.
     use : (N, C) uint8
         Cameras to align with.
     images : (C, H, W) float32
@@ -279,6 +290,7 @@ def align_patches(
             rows,
             templates,
             usable,
+            doubt,
             use,
             images,
             level,

@@ -17,6 +17,7 @@ from geomocap.model.frame_geometry import Voxels
 
 _ALL_FACES = 63
 _MARGIN_PX = 2
+_WIDE = 3.0  # blurs; the mean over that is taken away
 _EMPTY = 1e-3  # fraction of subject under the blur below which a pixel has no value
 
 
@@ -27,7 +28,8 @@ class FrameViews:
     Attributes
     ----------
     levels : (L, C, H, W) float32
-        Grey images without background, blurred, coarsest first.
+        Grey images without background, blurred, coarsest first. The finest is less its mean over a wider piece: light
+        and shade, which are wide, don't turn with the surface, and would pull patches along.
     masks : (C, H, W) uint8
         1 where the subject is.
     allowed : (C, H, W) uint8
@@ -211,6 +213,14 @@ def _blur(image: np.ndarray, mask: np.ndarray, blurs_px: Sequence[float], out: n
     inside = mask[part].astype(np.float32)
     grey = cv2.cvtColor(np.ascontiguousarray(image[part]), cv2.COLOR_RGB2GRAY).astype(np.float32) * inside
     for level, blur in enumerate(blurs_px):
-        weight = cv2.GaussianBlur(inside, (0, 0), blur)
-        value = cv2.GaussianBlur(grey, (0, 0), blur)
-        out[(level, *part)] = np.where(weight > _EMPTY, value / np.maximum(weight, _EMPTY), 0.0)
+        mean, weight = _mean(grey, inside, blur)
+        if level == len(blurs_px) - 1:
+            mean -= _mean(grey, inside, _WIDE * blur)[0]
+        out[(level, *part)] = np.where(weight > _EMPTY, mean, 0.0)
+
+
+def _mean(grey: np.ndarray, inside: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
+    """Gaussian mean of the subject's grey levels, and the fraction of subject in it; 0 without any."""
+    weight = cv2.GaussianBlur(inside, (0, 0), blur)
+    value = cv2.GaussianBlur(grey, (0, 0), blur)
+    return np.where(weight > _EMPTY, value / np.maximum(weight, _EMPTY), 0.0), weight

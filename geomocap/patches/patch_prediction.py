@@ -12,6 +12,7 @@ from geomocap.patches.frame_views import FrameViews
 
 _FLOW_WINDOW = (13, 13)
 _FLOW_LEVELS = 3
+_CONTRAST = 3.0  # bytes a grey level
 _FLOW_SIGMA = 1.5  # px; residual from which a camera's flow counts less
 _WEAK = 0.3  # m; a shift that no camera sees is taken as zero with this standard deviation
 
@@ -42,7 +43,7 @@ def image_flow(previous: FrameViews, view: FrameViews, positions: np.ndarray, se
         if not len(rows) or not both.any():
             continue
         box = _box(both, 24)
-        before, after = (np.clip(v.levels[-1, c][box], 0, 255).astype(np.uint8) for v in (previous, view))
+        before, after = (_bytes(v.levels[-1, c][box]) for v in (previous, view))
         corner = np.array([box[1].start, box[0].start], float)
         start = (pixel[rows, c] - corner).astype(np.float32)[:, None]
         found, status, _ = cv2.calcOpticalFlowPyrLK(
@@ -147,6 +148,11 @@ def nearest(positions: np.ndarray, of: np.ndarray, among: np.ndarray, count: int
     # put the patch itself last, then cut it off
     order = np.argsort(found == of[:, None], axis=1, kind="stable")
     return np.take_along_axis(found, order, axis=1)[:, :count]
+
+
+def _bytes(level: np.ndarray) -> np.ndarray:
+    """Grey levels about 0 as bytes, with more contrast: OpenCV's flow takes nothing else."""
+    return np.clip(128 + _CONTRAST * level, 0, 255).astype(np.uint8)
 
 
 def _box(mask: np.ndarray, margin: int) -> tuple[slice, slice]:

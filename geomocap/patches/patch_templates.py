@@ -10,7 +10,7 @@ from numba import njit, prange
 LEAST_SAMPLES = 0.6
 """Fraction of a template's samples that a camera must show for it to count."""
 
-LEAST_VARIANCE = 4.0
+LEAST_VARIANCE = 0.5
 """Least variance of the grey levels under a patch."""
 
 
@@ -74,9 +74,12 @@ def _take_template(n, X, Q, shape, rows, want, levels, masks, P, templates, usab
         if not want[n, c]:
             continue
         local_camera(P[c], X[n], Q[n], A)
-        count, total, square = 0, 0.0, 0.0
+        count, offered, total, square = 0, 0, 0.0, 0.0
         for q in range(M):
             usable[row, c, q] = 0
+            if np.isnan(shape[n, q, 0]):
+                continue
+            offered += 1
             s, t, z, zs, zt = shape[n, q, 0], shape[n, q, 1], shape[n, q, 2], shape[n, q, 3], shape[n, q, 4]
             w = A[2, 0] * s + A[2, 1] * t + A[2, 2] * z + A[2, 3]
             if w <= 0:
@@ -104,7 +107,7 @@ def _take_template(n, X, Q, shape, rows, want, levels, masks, P, templates, usab
             value = templates[row, c, L - 1, q, 0]
             total += value
             square += value * value
-        if count < LEAST_SAMPLES * M or square / count - (total / count) ** 2 < LEAST_VARIANCE:
+        if count < max(LEAST_SAMPLES * offered, 1) or square / count - (total / count) ** 2 < LEAST_VARIANCE:
             want[n, c] = 0
 
 
@@ -117,7 +120,7 @@ def take_templates(X, Q, shape, rows, want, levels, masks, P, templates, usable)
     X, Q : (N, 3), (N, 3, 3) float
         Places of the patches.
     shape : (N, M, 5) float
-        Samples in the patch's frame and slopes of the surface: s, t, z, z_s, z_t.
+        Samples in the patch's frame and slopes of the surface: s, t, z, z_s, z_t; NaN where a narrow patch has none.
     rows : (N,) int
         Where the patches have their templates.
     want : (N, C) uint8

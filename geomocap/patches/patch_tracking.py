@@ -17,19 +17,21 @@ from geomocap.patches.patch_prediction import orthonormal
 from geomocap.patches.patch_search import Followed, carry_lost, hiding_depth, judge, new_views, renewed, search
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.patches.reacquisition import reacquire
-from geomocap.patches.seeding import patch_radius, seed_for_one_camera, seed_patches, seed_spacing
+from geomocap.patches.seeding import patch_radii, seed_for_one_camera, seed_patches, seed_spacing
 from geomocap.patches.surface_patches import PatchAlignment, Patches, doubted, with_templates
 from geomocap.patches.swings import find_pieces, lost_pieces
 from geomocap.patches.track_record import TrackRecord
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads
 from geomocap.trajectories.joining import join_broken
+from geomocap.trajectories.neighbour_precision import clear_unsure, with_observed_precision
 
 _SMOOTH = 0.7  # fraction of the newest motion in the velocity
 _DOUBLE = 0.5  # of the spacing: patches nearer than that follow the same surface
 _LONG_BESIDE = 4  # frames after which the younger one is given up
 _SAME_SIDE = 0.5  # cosine between normals
 _LOOK_EVERY = 3  # frames between looks for lost patches in all cameras
+_UNSURE = 2.0  # times the standard deviation allowed in a frame that one may have since a patch was placed
 _SURE = 0.9  # correlation from which such a patch is found,
 _SURE_IN_PIECE = 0.8  # and one of a piece, of which others were found
 
@@ -48,7 +50,8 @@ def track_surface(
     run for some frames beside an older one, with which they are joined. Frames come in order and two are held.
     Where the cameras are so few that two of them agree on less than a part (`one_camera_below`) of the first frame's
     surface, the rest gets patches of single cameras. Their depth is that of the volume, adjusted to the motion of what
-    is around them.
+    is around them. Standard deviations are those that neighbours bear out; what
+    has too large ones is left out.
 
     Parameters
     ----------
@@ -70,7 +73,7 @@ def track_surface(
             return track_surface(frames, n_frames, settings, progress, own)
     rng = np.random.default_rng(settings.seed)
     record = TrackRecord(n_frames)
-    spacing = 0.0
+    spacing = pixel = 0.0
     state: Followed | None = None
     seeds: dict[int, Followed] = {}
     previous = None
@@ -79,7 +82,8 @@ def track_surface(
     for k, view in _stream(frames, range(n_frames), executor, "track forward", progress):
         if state is None:
             spacing = seed_spacing(view, settings.n_patches)
-            settings = settings.model_copy(update={"radius_px": patch_radius(view, spacing, settings)})
+            pixel = float(np.median(view.pixel_size(view.surface)))
+            settings = settings.model_copy(update={"radius_px": patch_radii(view, spacing, settings)[0]})
         elif previous is not None:
             state = _next(state, previous, view, settings, record, k, spacing, forward=True)
         if k % settings.seed_every == 0 or k == n_frames - 1:
@@ -115,7 +119,9 @@ def track_surface(
         if state is not None:
             record.ended(state.identity, state.last_reason, forward=False)
     found = record.trajectories(count)
-    return join_broken(adjust_depths(found) if by_one else found)
+    found = with_observed_precision(join_broken(adjust_depths(found) if by_one else found))
+    clear_unsure(found, _UNSURE * settings.sigma_px * pixel)
+    return found
 
 
 def _stream(

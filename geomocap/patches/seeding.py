@@ -16,7 +16,6 @@ _FACING = 0.35
 _FACING_ALONE = 0.5  # of a camera that sees a patch alone
 _HULL_SLACK = 3.0  # voxels that a seed may lie behind the drawn surface
 _REGULAR = 1e-12
-_ROUNDS = 3
 _PACKING = 0.7  # points placed at random at least r apart, as many as fit: 0.7 a square of r
 _NOISE_FRACTION = 0.4  # of the standard deviation allowed that a patch has in the very image it comes from
 _LEAST_RADIUS_PX = 3  # smaller patches hold too little texture
@@ -43,13 +42,15 @@ def image_reduction(view: FrameViews, settings: TrackingSettings) -> int:
     return max(1, round(_COVER * seed_spacing(view, settings.n_patches) / (settings.radius_px * pixel)))
 
 
-def patch_radius(view: FrameViews, spacing: float, settings: TrackingSettings) -> int:
-    """Return half the width of patches `spacing` (m) apart in pixels: they cover the surface twice, and no more.
+def patch_radii(view: FrameViews, spacing: float, settings: TrackingSettings) -> tuple[int, int]:
+    """Return half the widths of patches `spacing` (m) apart in pixels: of wide ones, and of narrow ones.
 
-    Between three and `radius_px`: wider ones reach round the limbs of a subject that is small in the images.
+    Narrow ones cover the surface twice. Wide ones, twice as wide, hold more texture; they reach round the limbs of a
+    subject that is small in the images. Both are between three and `radius_px`.
     """
     pixel = float(np.median(view.pixel_size(view.surface)))
-    return min(settings.radius_px, max(_LEAST_RADIUS_PX, round(_COVER * spacing / pixel)))
+    wide, narrow = (max(_LEAST_RADIUS_PX, round(k * _COVER * spacing / pixel)) for k in (2, 1))
+    return min(settings.radius_px, wide), min(settings.radius_px, narrow)
 
 
 def spread(points: np.ndarray, spacing: float, taken: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -113,7 +114,7 @@ def surface_frames(view: FrameViews, points: np.ndarray) -> tuple[np.ndarray, np
     return positions, frames, np.clip(fit[:, 3:], -0.5 / radius, 0.5 / radius)
 
 
-def patch_shape(curvature: np.ndarray, size: np.ndarray, radius_px: int) -> np.ndarray:
+def patch_shape(curvature: np.ndarray, size: np.ndarray, radius_px: int, narrow_px: int | None = None) -> np.ndarray:
     """Return samples of patches on a square grid: (N, M, 5) s, t, z (m), ∂z/∂s, ∂z/∂t.
 
     Parameters
@@ -123,11 +124,17 @@ def patch_shape(curvature: np.ndarray, size: np.ndarray, radius_px: int) -> np.n
         Spacing of the samples, metres.
     radius_px : int
         M = (2 radius_px + 1)² samples.
+    narrow_px : int, optional
+        The samples beyond are NaN: narrow patches among wide ones.
     """
     steps = np.arange(-radius_px, radius_px + 1)
     s, t = (np.outer(size, g.ravel()) for g in np.meshgrid(steps, steps))
     a, b, c = (curvature[:, k, None] for k in range(3))
-    return np.stack([s, t, a * s * s + b * s * t + c * t * t, 2 * a * s + b * t, b * s + 2 * c * t], axis=2)
+    shape = np.stack([s, t, a * s * s + b * s * t + c * t * t, 2 * a * s + b * t, b * s + 2 * c * t], axis=2)
+    if narrow_px is not None:
+        far = np.abs(steps) > narrow_px
+        shape[:, (far[:, None] | far).ravel()] = np.nan
+    return shape
 
 
 def seed_patches(
@@ -139,7 +146,8 @@ def seed_patches(
 ) -> Patches:
     """Place new patches where a frame's surface has none.
 
-    Places where cameras don't agree are tried again a little beside, twice.
+    First wide ones; where cameras don't agree on these, narrow ones a little beside, twice.
+
     Parameters
     ----------
     view : FrameViews
@@ -154,7 +162,8 @@ def seed_patches(
     patches = Patches.empty(M, C, L)
     tree = cKDTree(view.surface)
     tried = np.zeros(len(view.surface), bool)
-    for _ in range(_ROUNDS):
+    wide, narrow = patch_radii(view, spacing, settings)
+    for radius in (wide, narrow, narrow):
         candidates = np.flatnonzero(~tried)
         # a hull stands off the true surface: what is there already counts where it shows on the hull
         there = view.surface[tree.query(np.concatenate([taken, patches.positions]))[1]]
@@ -162,7 +171,7 @@ def seed_patches(
         if not len(chosen):
             break
         tried[chosen] = True
-        patches = patches.join(_seed_at(view.surface[chosen], view, settings))
+        patches = patches.join(_seed_at(view.surface[chosen], view, settings, radius))
     return patches
 
 
@@ -176,7 +185,7 @@ def seed_for_one_camera(
     """
     there = view.surface[cKDTree(view.surface).query(taken)[1]]
     points = view.surface[spread(view.surface, spacing, there, rng)]
-    blank, seen, cosine = _blank(points, view, settings, least_views=1, facing=_FACING_ALONE)
+    blank, seen, cosine = _blank(points, view, settings, 1, _FACING_ALONE, patch_radii(view, spacing, settings)[1])
     seen &= nothing_behind(view, blank.positions)
     some = seen.any(axis=1)
     patches, reference = _of_best_camera(blank.select(np.flatnonzero(some)), seen[some], cosine[some], view)
@@ -186,9 +195,9 @@ def seed_for_one_camera(
     return patches.select(keep[fits])
 
 
-def _seed_at(points: np.ndarray, view: FrameViews, settings: TrackingSettings) -> Patches:
+def _seed_at(points: np.ndarray, view: FrameViews, settings: TrackingSettings, radius_px: int) -> Patches:
     """Make patches at points of the surface (N, 3), as far as two cameras agree on them."""
-    blank, seen, cosine = _blank(points, view, settings, least_views=settings.n_views, facing=_FACING)
+    blank, seen, cosine = _blank(points, view, settings, settings.n_views, _FACING, radius_px)
     # a patch belongs to the camera that faces it best; it needs a second one
     patches, reference = _of_best_camera(blank, seen, cosine, view)
     keep = np.flatnonzero(patches.has.any(axis=1))
@@ -196,7 +205,7 @@ def _seed_at(points: np.ndarray, view: FrameViews, settings: TrackingSettings) -
 
 
 def _blank(
-    points: np.ndarray, view: FrameViews, settings: TrackingSettings, least_views: int, facing: float
+    points: np.ndarray, view: FrameViews, settings: TrackingSettings, least_views: int, facing: float, radius_px: int
 ) -> tuple[Patches, np.ndarray, np.ndarray]:
     """Patches without templates where enough cameras see the surface, those cameras, and the cosines to them."""
     positions, frames, curvature = surface_frames(view, points)
@@ -206,7 +215,7 @@ def _blank(
     positions, frames, curvature, cosine, seen = (a[good] for a in (positions, frames, curvature, cosine, seen))
     best = np.where(seen, cosine, -1).argmax(axis=1)
     size = view.pixel_size(positions)[np.arange(len(positions)), best]
-    shape = patch_shape(curvature, size, settings.radius_px)
+    shape = patch_shape(curvature, size, settings.radius_px, radius_px)
     blank = Patches.without_templates(positions, frames, shape, size, view.count, len(view.levels))
     return blank, seen, cosine
 

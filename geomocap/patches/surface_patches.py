@@ -83,7 +83,8 @@ class Patches:
     frames : (N, 3, 3) float
         World from patch frame, rotations; third axis: outward normal.
     shape : (N, M, 5) float
-        Samples in the patch's frame and slopes of the surface there: s, t, z (m), ∂z/∂s, ∂z/∂t.
+        Samples in the patch's frame and slopes of the surface there: s, t, z (m), ∂z/∂s, ∂z/∂t; NaN where a narrow
+        patch has none.
     size : (N,) float
         Spacing of the samples: about a pixel, metres.
     rows : (N,) int
@@ -227,16 +228,20 @@ def one_template(patches: Patches, view: FrameViews) -> tuple[Patches, np.ndarra
         name: np.ascontiguousarray(np.repeat(getattr(patches, name)[patches.rows, best][:, None], view.count, axis=1))
         for name in ("templates", "usable")
     }
-    return replace(patches, rows=np.arange(len(patches)), has=np.ones_like(patches.has), **shared), best
+    sure = np.zeros_like(patches.doubt)  # it is the same for all cameras
+    return replace(patches, rows=np.arange(len(patches)), has=np.ones_like(patches.has), doubt=sure, **shared), best
 
 
 def doubted(patches: Patches, found: PatchAlignment) -> PatchAlignment:
-    """Add to standard deviations how well the places were known at which templates were taken: drift adds up."""
+    """Add to standard deviations how well the places were known at which templates were taken: drift adds up.
+
+    The templates of a patch err together, as they were taken where others had put it; each counts as it weighs.
+    """
     part = found.by_camera > -1
-    variance = np.where(part, patches.doubt**2, 0.0).sum(axis=1) / np.maximum(part.sum(axis=1), 1)
-    return replace(
-        found, sigma=np.sqrt(found.sigma**2 + variance), image_sigma=np.sqrt(found.image_sigma**2 + variance)
-    )
+    own = (found.image_sigma**2 * np.maximum(part.sum(axis=1), 1))[:, None]
+    weight = np.where(part & np.isfinite(own), 1.0 / (own + patches.doubt**2), 0.0)
+    together = (weight * patches.doubt).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-30)
+    return replace(found, sigma=np.hypot(found.sigma, together), image_sigma=np.hypot(found.image_sigma, together))
 
 
 def align(
@@ -291,6 +296,7 @@ def align(
             patches.rows,
             patches.templates,
             patches.usable,
+            patches.doubt,
             np.ascontiguousarray(use, np.uint8),
             view.levels[level],
             level,

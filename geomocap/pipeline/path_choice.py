@@ -12,6 +12,7 @@ from geomocap.model.frame_geometry import Geometry
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.trajectories import Trajectories
 from geomocap.nodes.node_tracking import track_nodes
+from geomocap.nodes.surface_coverage import SMALLEST_PIECE, left_over, piece_reach, uncovered_fraction
 from geomocap.pipeline.job import Job
 from geomocap.segmentation.m3 import ellipsoid_paths
 from geomocap.trajectories.selection import spread_out
@@ -20,14 +21,16 @@ SAMPLES = 2000  # motion paths that bodies are found from
 ALONE_FRACTION = (
     0.5  # of the standard deviation of what a single camera sees, as most of that is depth and hardly counts
 )
-LEAST_SAMPLES = 300  # fewer long trajectories than these don't cover a subject: nodes are tracked instead
-LEAST_COVERAGE = 0.4  # nor do trajectories that are measured, on average, in a smaller fraction of the frames
 ANCHORS = 2000  # trajectories that keep nodes from sliding
 ANCHOR_FRACTION = 0.1  # those are measured in this fraction of the frames at least
 
 
 def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> tuple[MotionPaths, str]:
-    """Motion paths and what they are: "patches", "nodes", "both" (nodes held by patches), "points" or "ellipsoids".
+    """Motion paths and what they are.
+
+    These are "patches", "nodes", "both" (nodes held by patches), "pieces" (patches, and where these leave pieces of the
+    surface uncovered, nodes held by them), "points" or "ellipsoids". Nodes are followed only where some piece needs
+    them.
 
     Parameters
     ----------
@@ -50,21 +53,33 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> tuple[Motion
         found = ellipsoid_paths(geometry.points, len(geometry), geometry.spacing, settings, job.executor, job.progress)
         return MotionPaths(found.ellipsoids.centers.swapaxes(0, 1)), wanted
     tracked = read_trajectories(job.run) if has_tracks else None
-    if tracked is not None and wanted != "both":
-        paths = patch_paths(tracked)
-        if paths is not None and (wanted == "patches" or _covers(paths)):
-            return paths, "patches"
+    patches = None if tracked is None or wanted == "both" else patch_paths(tracked)
     if wanted == "patches":
-        raise GeometryError(
-            f"{job.run.path}: no surface patches could be followed in the images; set segmentation.paths = nodes"
-        )
+        if patches is None:
+            raise GeometryError(
+                f"{job.run.path}: no surface patches could be followed in the images; set segmentation.paths = nodes"
+            )
+        return patches, "patches"
+    reach = 0.0
+    if patches is not None:
+        reach = piece_reach(geometry.points(0))
+        if uncovered_fraction(geometry.points, patches.positions, reach) < SMALLEST_PIECE:
+            return patches, "patches"
+    nodes = _follow_nodes(job, geometry, None if tracked is None else _anchors(tracked))
+    if patches is None:
+        return nodes, "nodes" if tracked is None else "both"
+    rest = left_over(nodes.positions, patches.positions, reach)
+    return _joined(patches, nodes, rest), "pieces"
+
+
+def _follow_nodes(job: Job, geometry: Geometry, anchors: np.ndarray | None) -> MotionPaths:
+    """Follow nodes of the geometry, which `anchors` (P, T, 3), metres, keep from sliding."""
     features = geometry.features if job.config.nodes.colors else None
-    anchors = None if tracked is None else _anchors(tracked)
     following = job.config.nodes
     if job.capture is not None:  # the hull changes its shape with the pose: what is rigid doesn't look so
         following = following.model_copy(update={"part_rounds": 0})
     nodes = track_nodes(geometry.points, len(geometry), following, features, job.progress, job.executor, anchors)
-    return nodes.motion_paths(), "nodes" if anchors is None else "both"
+    return nodes.motion_paths()
 
 
 def point_paths(job: Job, geometry: Geometry) -> MotionPaths | None:
@@ -97,8 +112,18 @@ def patch_paths(tracked: Trajectories) -> MotionPaths | None:
     return MotionPaths(tracked.positions[chosen], sigma=np.where(alone, ALONE_FRACTION, 1.0) * sigma, ray=ray)
 
 
-def _covers(paths: MotionPaths) -> bool:
-    return paths.count >= LEAST_SAMPLES and float(paths.seen.mean()) >= LEAST_COVERAGE
+def _joined(patches: MotionPaths, nodes: MotionPaths, rest: np.ndarray) -> MotionPaths:
+    """Patches followed by the nodes that are on the rest of the surface, (K,) bool, each with its own precision."""
+    if not rest.any():
+        return patches
+    positions = np.concatenate([patches.positions, nodes.positions[rest]])
+    assert patches.sigma is not None and nodes.sigma is not None
+    sigma = np.concatenate([patches.sigma, nodes.sigma[rest]])
+    if patches.ray is None:
+        return MotionPaths(positions, sigma=sigma)
+    return MotionPaths(
+        positions, sigma=sigma, ray=np.concatenate([patches.ray, np.zeros((rest.sum(), *patches.ray.shape[1:]))])
+    )
 
 
 def _anchors(tracked: Trajectories) -> np.ndarray | None:

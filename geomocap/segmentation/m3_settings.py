@@ -26,7 +26,8 @@ class SegmentationSettings(Settings):
         description="what follows the surface: patches of the images; nodes on the geometry alone (the images are then "
         "not tracked at all); both: nodes that patches keep from sliding; points: those of scans which are the same in "
         "all frames; ellipsoids: the paper's, split, merged and matched, for comparison; auto: of a capture patches "
-        "where they cover the subject, otherwise both; of scans points where neighbours stay so, otherwise nodes",
+        "where they cover the surface, and on the rest of it nodes that they hold; of scans points where neighbours "
+        "stay so, otherwise nodes",
         json_schema_extra={
             "flag": "paths",
             "evidence": "as above, but without soft borders and refinement: patches 0.81 / 0.97 and 0.64 / 0.75, nodes "

@@ -33,7 +33,7 @@ def spacing(views):
 
 @pytest.fixture(scope="module")
 def seeds(views, spacing):
-    return seed_patches(views[0], np.zeros((0, 3)), spacing, SETTINGS, np.random.default_rng(0))
+    return seed_patches(views[0], np.zeros((0, 3)), spacing, SETTINGS, np.random.default_rng(3))
 
 
 @pytest.fixture(scope="module")

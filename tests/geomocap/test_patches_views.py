@@ -60,11 +60,26 @@ def test_frame_views_refuse_images_of_another_size(scene):
         FrameViews.of(views, images, nothing)
 
 
+def test_light_and_shade_do_not_count(scene):
+    """Brightness that changes over more of the image than a patch leaves no more than a trace."""
+    images, masks = scene.images(0)
+    views = PinholeViews.of(scene.projections(), masks)
+    across = np.linspace(-40, 40, images.shape[2])
+    lit = np.clip(images.astype(float) + across[None, None, :, None], 0, 255).astype(np.uint8)
+    plain, shaded = (FrameViews.of(views, i, scene.voxels(0)).levels[1] for i in (images, lit))
+    clipped = (lit == 0).any(axis=3) | (lit == 255).any(axis=3)
+    inside = np.stack([binary_erosion(m & ~c, iterations=8) for m, c in zip(masks != 0, clipped, strict=True)])
+    assert inside.sum() > 1000
+    change = (shaded - plain)[inside]
+    assert np.abs(change).max() < 0.1 * np.ptp(np.broadcast_to(across, inside.shape)[inside])
+    assert plain[inside].std() > 10 * change.std()
+
+
 def test_reduced_frames_show_the_same_scene_in_larger_pixels(scene):
     fine = MovingEllipsoid(width=321, height=243, focal=520.0)
     images, masks = fine.images(0)
     views = PinholeViews.of(fine.projections(), masks)
-    full = FrameViews.of(views, images, fine.voxels(0))
+    full = FrameViews.of(views, images, fine.voxels(0), (5.0, 1.6))  # the same blurs in metres
     half = FrameViews.of(views, images, fine.voxels(0), reduction=2)
     assert half.levels.shape == (2, 6, 121, 160)
     points = np.array([[0.1, 0.05, 0.1], [-0.1, 0, 0]])

@@ -53,9 +53,13 @@ def job(tmp_path):
         yield make
 
 
-def trajectories(count: int, seen: float) -> np.ndarray:
+def trajectories(count: int, seen: float, lowest: float = -1.0) -> np.ndarray:
+    """Points of the ball above z = `lowest` · 0.5 that move with it, each measured in a fraction of the frames."""
     rng = np.random.default_rng(0)
-    tracks = rng.normal(size=(count, 1, 3)) + 0.05 * np.arange(FRAMES)[None, :, None]
+    d = rng.normal(size=(20 * count, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    d = d[d[:, 2] > lowest][:count]
+    tracks = (d * [1.0, 0.8, 0.5])[:, None] + 0.05 * np.arange(FRAMES)[None, :, None] * [1.0, 0, 0]
     tracks[rng.random((count, FRAMES)) > seen] = np.nan
     return tracks
 
@@ -70,8 +74,24 @@ def test_patches_where_they_cover_the_subject(job):
     assert motion_paths(job("auto", trajectories(500, 1.0)), Ball(), True)[1] == "patches"
 
 
-def test_both_where_there_are_too_few_patches(job):
-    assert motion_paths(job("auto", trajectories(100, 1.0)), Ball(), True)[1] == "both"
+def test_nodes_on_the_piece_that_patches_leave_uncovered(job):
+    tracks = trajectories(300, 1.0, 0.0)
+    paths, source = motion_paths(job("auto", tracks), Ball(), True)
+    assert source == "pieces"
+    patches, nodes = paths.positions[:300], paths.positions[300:]
+    np.testing.assert_array_equal(patches, tracks)
+    assert 15 <= len(nodes) <= 30  # of 60, those on the half without patches
+    assert (np.nanmax(nodes[:, :, 2], axis=1) < 0.0).all()
+    # the nodes' precision is their own: nothing holds them along the surface
+    assert np.nanmedian(paths.sigma[300:]) > 5 * np.nanmedian(paths.sigma[:300])
+
+
+def test_nodes_where_patches_are_there_for_a_while_only(job):
+    tracks = trajectories(300, 1.0)
+    tracks[:, 1:][tracks[:, 1:, 2] < 0] = np.nan  # 2 of 3 frames
+    paths, source = motion_paths(job("auto", tracks), Ball(), True)
+    assert source == "pieces"
+    assert (np.nanmax(paths.positions[300:, :, 2], axis=1) < 0.0).all()
 
 
 def test_nodes_without_patches(job):
@@ -87,7 +107,7 @@ def test_both_although_patches_cover_the_subject(job):
 
 
 def test_few_patches_where_they_are_asked_for(job):
-    assert motion_paths(job("patches", trajectories(100, 1.0)), Ball(), True)[1] == "patches"
+    assert motion_paths(job("patches", trajectories(100, 1.0, 0.8)), Ball(), True)[1] == "patches"
 
 
 def test_ellipsoids_of_the_paper(job):
