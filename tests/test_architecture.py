@@ -24,7 +24,7 @@ ROOMS: dict[str, set[str]] = {
     "files": VALUES | {"source_digest", "version"},
     # from images to geometry
     "calibration": VALUES | {"files"},
-    "silhouettes": VALUES,
+    "silhouettes": VALUES | {"carving"},
     "carving": VALUES,
     "matching": VALUES,
     "dense": VALUES | {"matching"},

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial, reduce
+from operator import add
 from pathlib import Path
 
 import cv2
@@ -18,9 +20,13 @@ from geomocap.files.run import Run, stage_key
 from geomocap.pipeline.job import Job
 from geomocap.scheduling import map_items
 from geomocap.silhouettes.background import BackgroundModel, model_from_frames, model_from_plate
-from geomocap.silhouettes.extraction import silhouette
+from geomocap.silhouettes.joint_decision import CameraEvidence, decide, learn_from
+from geomocap.silhouettes.likelihood import Counts, Likelihood
+from geomocap.silhouettes.other_cameras import OtherCameras
 from geomocap.silhouettes.region import region_of_points
 from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
+
+LEARNING_FRAMES = 6  # spread over the capture
 
 
 def silhouettes(job: Job) -> str:
@@ -43,18 +49,27 @@ def _make_silhouettes(job: Job, capture: Capture) -> int:
     missing = [
         k for k in range(capture.n_frames) if not all(job.run.silhouette_file(c, k).exists() for c in capture.cameras)
     ]
-    models: dict[str, BackgroundModel] = {}
+    task: Callable[[int], None] = _Copy(capture, job.run)
     if missing and not capture.has_masks:
-        learn = _Learn(capture, job.config.silhouettes)
-        learnt = map_items(learn, capture.cameras, job.executor, "background", job.progress, 2)
-        models = dict(zip(capture.cameras, learnt, strict=True))
-    undistortion = None
-    if job.config.silhouettes.repair and capture.is_calibrated and not capture.has_masks:
-        undistortion = Undistortion.of(capture.rig)
-    task = _Cut(capture, job.run, job.config.silhouettes, models, _regions(capture), undistortion)
+        task = _Cut(job.run, learn_scene(job))
     for _ in map_items(task, missing, job.executor, "silhouettes", job.progress, 4):
         pass
     return len(missing) * len(capture.cameras)
+
+
+def learn_scene(job: Job) -> LearntScene:
+    """Learn what the cameras see without the subject, and how subject and background differ."""
+    capture, settings = job.capture, job.config.silhouettes
+    assert capture is not None
+    learn = _Learn(capture, settings)
+    models = tuple(map_items(learn, capture.cameras, job.executor, "background", job.progress, 2))
+    others = OtherCameras.of(capture.rig) if settings.joint and capture.is_calibrated and len(models) > 1 else None
+    undistortion = Undistortion.of(capture.rig) if others is not None else None
+    unlearnt = Likelihood.unlearnt(len(models))
+    scene = LearntScene(capture, settings, models, _regions(capture), others, undistortion, unlearnt)
+    some = np.unique(np.linspace(0, capture.n_frames - 1, min(LEARNING_FRAMES, capture.n_frames)).round().astype(int))
+    counts = list(map_items(scene.learn, some.tolist(), job.executor, "likelihood", job.progress, 4))
+    return replace(scene, likelihood=Likelihood.of(reduce(add, counts)))
 
 
 @dataclass(frozen=True)
@@ -75,29 +90,61 @@ class _Learn:
 
 
 @dataclass(frozen=True)
+class LearntScene:
+    """What the silhouettes of any frame need."""
+
+    capture: Capture
+    settings: SilhouetteSettings
+    models: tuple[BackgroundModel, ...]
+    regions: dict[str, np.ndarray]
+    others: OtherCameras | None
+    undistortion: Undistortion | None
+    likelihood: Likelihood
+
+    def views(self, frame: int) -> list[CameraEvidence]:
+        """Read the images of a frame and compare them with the background."""
+        shadows = bool(np.isfinite(self.likelihood.shadow).any())
+        return [
+            CameraEvidence.of(self.capture.frame(c, frame), model, self.settings, self.regions.get(c), shadows)
+            for c, model in zip(self.capture.cameras, self.models, strict=True)
+        ]
+
+    def learn(self, frame: int) -> Counts:
+        """Count what a frame tells about subject and background."""
+        return learn_from(self.views(frame), self.others, self.settings)
+
+    def silhouettes(self, frame: int) -> tuple[np.ndarray, ...]:
+        """Cut out a frame's silhouettes, C arrays (H, W) bool."""
+        masks = decide(self.views(frame), self.likelihood, self.others, self.settings).masks
+        if self.undistortion is None:
+            return masks
+        given = [m.astype(np.uint8) * np.uint8(255) for m in masks]
+        return tuple(m > 0 for m in fill_false_holes(self.capture.rig, self.undistortion.views(given), given))
+
+
+@dataclass(frozen=True)
 class _Cut:
     """Silhouettes of one frame, written to the run."""
 
-    capture: Capture
     run: Run
-    settings: SilhouetteSettings
-    models: dict[str, BackgroundModel]
-    regions: dict[str, np.ndarray]
-    undistortion: Undistortion | None
+    scene: LearntScene
 
     def __call__(self, frame: int) -> None:
-        masks = [self.cut(camera, frame) for camera in self.capture.cameras]
-        if self.undistortion is not None:
-            masks = fill_false_holes(self.capture.rig, self.undistortion.views(masks), masks)
-        for camera, mask in zip(self.capture.cameras, masks, strict=True):
-            write_atomic(self.run.silhouette_file(camera, frame), partial(_write_mask, mask))
+        for camera, mask in zip(self.scene.capture.cameras, self.scene.silhouettes(frame), strict=True):
+            write_atomic(self.run.silhouette_file(camera, frame), partial(_write_mask, mask * np.uint8(255)))
 
-    def cut(self, camera: str, frame: int) -> np.ndarray:
-        """Silhouette of one image, (H, W) uint8, 0 or 255."""
-        if self.capture.has_masks:
-            return self.capture.mask(camera, frame)
-        image = self.capture.frame(camera, frame)
-        return silhouette(image, self.models[camera], self.settings, self.regions.get(camera))
+
+@dataclass(frozen=True)
+class _Copy:
+    """Given masks of one frame, written to the run."""
+
+    capture: Capture
+    run: Run
+
+    def __call__(self, frame: int) -> None:
+        for camera in self.capture.cameras:
+            mask = self.capture.mask(camera, frame)
+            write_atomic(self.run.silhouette_file(camera, frame), partial(_write_mask, mask))
 
 
 def _write_mask(mask: np.ndarray, path: Path) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 LEAST_NOISE = 0.7  # grey levels; 8-bit rounding alone gives 0.29, compression hides the rest in flat parts
 GRADIENT_BINS = 12
 MOST_JITTER = 0.3  # pixels that edges move at most, by compression and vibration
+TEXTURE_WINDOW = 5  # pixels along its side
 LIT = 0.15  # fraction of the frames that must show a place lit for the others to be its shadow
 
 
@@ -33,12 +34,16 @@ class BackgroundModel:
         Where the background is known.
     camera : str
         Name of the camera, for messages.
+    texture : (H, W) float32
+        Variance of the background within small windows, slopes left out, in variances of the noise.
+        Made from the others.
     """
 
     mean: np.ndarray
     sigma: np.ndarray
     known: np.ndarray
     camera: str = ""
+    texture: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         shape = np.shape(self.known)
@@ -50,6 +55,7 @@ class BackgroundModel:
         object.__setattr__(self, "mean", np.ascontiguousarray(self.mean, np.float32))
         object.__setattr__(self, "sigma", np.ascontiguousarray(self.sigma, np.float32))
         object.__setattr__(self, "known", np.ascontiguousarray(self.known, bool))
+        object.__setattr__(self, "texture", _texture(self.mean, self.sigma))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -223,6 +229,14 @@ def _noise(
     steepest = [max(0.0, v - a) / u for u, v in zip(x, y, strict=True) if u > 4.0][-4:]
     b = min(float(np.median(steepest)), MOST_JITTER**2) if steepest else 0.0
     return np.sqrt(a + b * gradient**2).astype(np.float32)
+
+
+def _texture(mean: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Variance within windows less that of noise, in variances of the noise: (H, W) float32."""
+    window = (TEXTURE_WINDOW, TEXTURE_WINDOW)
+    fine = mean - cv2.blur(mean, window)
+    variance = cv2.blur((fine * fine).mean(axis=-1), window)
+    return np.maximum(np.float32(0), variance / (sigma * sigma) - np.float32(1))
 
 
 def _gradient(mean: np.ndarray) -> np.ndarray:

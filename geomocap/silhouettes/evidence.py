@@ -1,25 +1,23 @@
-"""Evidence of each pixel for the subject: log likelihood ratio of subject against background or its shadow."""
+"""Evidence of each pixel: its misfit against background or shadow, and the vote of its neighbours."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-LIMIT = 10.0  # no single pixel counts for more than exp(10) : 1 for the subject,
-LIMIT_BACK = 4.0  # nor for more than exp(4) : 1 for the background: subjects have its colours here and there
 TEXTURE_WEIGHT = 8.0  # independent samples that the texture of a window counts for: its neighbours vote as well
-NO_QUESTION = -3.0  # pixels with less evidence for the subject are background without more ado
+NO_QUESTION = 5.0  # pixels with less misfit are background without more ado
 HOPELESS = 25.0  # chi-square of a pixel's colour beyond which no shadow explains it
-SHADOW_PRIOR = 6.0  # log of how much likelier a matching shadow is than a subject of just that colour
-DOUBTFUL = -LIMIT_BACK  # below, no shadow and hardly any noise is left to explain: background
+SHADOW_RADIUS = 2  # half width of the windows that compare texture, pixels
+SHADOW_LIGHTEST = 1.1  # brightness of the strongest reflection on the background (ratio)
+SHADOW_COLOR = 0.03  # how much a shadow may change colour, and brightness within the window (ratio)
+SMOOTHING = 3.0  # reach of the vote, pixels
+EDGE = 12.0  # colour step that stops it, noise sigmas
 
 
 @njit(cache=True, nogil=True)
-def background_evidence(image, mean, sigma, known, gain, offset, threshold, unknown):
-    """Compare each pixel with the lit background.
-
-    Half the chi-square of the three channels, minus the prior at which it counts as subject (a subject's colours being
-    spread evenly), limited to -`LIMIT_BACK` … `LIMIT`.
+def background_misfit(image, mean, sigma, known, gain, offset):
+    """Compare each pixel with the lit background: half the chi-square of the three channels.
 
     Parameters
     ----------
@@ -28,37 +26,31 @@ def background_evidence(image, mean, sigma, known, gain, offset, threshold, unkn
     sigma : (H, W) float32
     known : (H, W) bool
     gain, offset : (3,) float32
-    threshold : float
-        Difference in sigmas where subject and background are equally likely.
-    unknown : float
-        Evidence where the background isn't known.
 
     Returns
     -------
     (H, W) float32
+        0 where the background isn't known.
     """
     h, w = known.shape
-    evidence = np.empty((h, w), np.float32)
-    prior = np.float32(0.5 * threshold * threshold)
-    limit, least = np.float32(LIMIT), np.float32(-LIMIT_BACK)
+    misfit = np.empty((h, w), np.float32)
     half = np.float32(0.5)
     for y in range(h):
         for x in range(w):
             if not known[y, x]:
-                evidence[y, x] = unknown
+                misfit[y, x] = np.float32(0.0)
                 continue
             a = np.float32(image[y, x, 0]) - gain[0] * mean[y, x, 0] - offset[0]
             b = np.float32(image[y, x, 1]) - gain[1] * mean[y, x, 1] - offset[1]
             c = np.float32(image[y, x, 2]) - gain[2] * mean[y, x, 2] - offset[2]
             s = sigma[y, x]
-            value = half * (a * a + b * b + c * c) / (s * s) - prior
-            evidence[y, x] = min(max(value, least), limit)
-    return evidence
+            misfit[y, x] = half * (a * a + b * b + c * c) / (s * s)
+    return misfit
 
 
 @njit(cache=True, nogil=True)
-def shadow_evidence(evidence, image, mean, sigma, known, gain, offset, radius, darkest, lightest, color):
-    """Lower the evidence where the background under a shadow (or reflection) explains the image as well.
+def shadow_misfit(direct, image, mean, sigma, known, gain, offset, darkest):
+    """Compare each pixel with the background under a shadow or reflection, where the lit background doesn't explain it.
 
     A window's shadow is a factor on the background that varies linearly in it (penumbra), by least squares. It explains
     a pixel in the window as far as the factor lies within [darkest, lightest], the channels' own factors hardly differ
@@ -68,23 +60,21 @@ def shadow_evidence(evidence, image, mean, sigma, known, gain, offset, radius, d
 
     Parameters
     ----------
-    evidence : (H, W) float32
-        Evidence against the lit background.
+    direct : (H, W) float32
+        Misfit of the lit background.
     image, mean, sigma, known, gain, offset
-        As in `background_evidence`.
-    radius : int
-        Half width of the windows, pixels.
-    darkest, lightest : float
-        Range of the shadow's factor.
-    color : float
-        Tolerance of the factors, between channels and within a window (ratio).
+        As in `background_misfit`.
+    darkest : float
+        Least factor of a shadow.
 
     Returns
     -------
     (H, W) float32
-        Evidence against background and shadow, the smaller of the two.
+        Half the chi-square of colour, texture and hue; infinite where no shadow is possible or asked for.
     """
     h, w = known.shape
+    darkest = np.float64(darkest)
+    radius, lightest, color = SHADOW_RADIUS, SHADOW_LIGHTEST, SHADOW_COLOR
     picture = np.zeros((h, w, 3), np.float32)  # 0 where unknown, as the next three
     lit = np.zeros((h, w, 3), np.float32)
     ib, bb = np.zeros((h, w), np.float32), np.zeros((h, w), np.float32)  # sums over the channels of I·B and B²
@@ -103,14 +93,14 @@ def shadow_evidence(evidence, image, mean, sigma, known, gain, offset, radius, d
     possible = np.zeros((h, w), np.bool_)
     for y in range(h):
         for x in range(w):
-            if evidence[y, x] > NO_QUESTION and known[y, x]:
+            if direct[y, x] > NO_QUESTION and known[y, x]:
                 noise = sigma[y, x] * sigma[y, x]
                 possible[y, x] = _may_be_shadow(picture, lit, ib, bb, noise, darkest, lightest, color, y, x)
                 if possible[y, x]:
                     _fit_window(
                         picture, lit, ib, bb, noise, radius, darkest, lightest, color, y, x, plane, tint, misfit
                     )
-    result = evidence.copy()
+    result = np.full((h, w), np.float32(np.inf), np.float32)
     for y in range(h):
         for x in range(w):
             if not possible[y, x]:
@@ -128,9 +118,7 @@ def shadow_evidence(evidence, image, mean, sigma, known, gain, offset, radius, d
                         left = picture[y, x, c] - shaded
                         own += left * left / (noise + color * color * shaded * shaded)
                     least = min(least, own)
-            value = max(np.float32(0.5 * least - SHADOW_PRIOR), np.float32(-LIMIT_BACK))
-            if value < evidence[y, x]:
-                result[y, x] = value
+            result[y, x] = np.float32(0.5) * least
     return result
 
 
@@ -225,21 +213,18 @@ def _fit_window(picture, lit, ib, bb, noise, radius, darkest, lightest, color, y
 
 
 @njit(cache=True, nogil=True)
-def smooth_evidence(evidence, image, sigma, reach, edge):
+def smooth_evidence(evidence, image, sigma):
     """Let neighbours vote, but not across colour edges of the image.
 
     A recursive filter over rows and columns, forwards and backwards, two rounds with falling reach, as the domain
     transform of Gastal & Oliveira (2011, section 4.2); its weights fall with the colour step in noise sigmas.
+    SMOOTHING is the vote's standard deviation where the image is flat, EDGE the step at which it falls off.
 
     Parameters
     ----------
     evidence : (H, W) float32
     image : (H, W, 3) uint8
     sigma : (H, W) float32
-    reach : float
-        Standard deviation of the vote where the image is flat, pixels.
-    edge : float
-        Colour step at which the vote falls off, sigmas.
 
     Returns
     -------
@@ -247,6 +232,7 @@ def smooth_evidence(evidence, image, sigma, reach, edge):
     """
     h, w = evidence.shape
     out = evidence.copy()
+    edge = np.float32(EDGE)
     right = np.empty((h, w), np.float32)
     down = np.empty((h, w), np.float32)
     for y in range(h):
@@ -266,7 +252,7 @@ def smooth_evidence(evidence, image, sigma, reach, edge):
             down[y, x] = np.float32(1.0) / (d * d)
     for k in range(2):
         # Rounds with standard deviations that add up to the reach: sigma sqrt(3) 2^(N-1-k) / sqrt(4^N - 1), N = 2.
-        a = np.float32(np.exp(-np.sqrt(2.0) / (reach * np.sqrt(3.0) * 2.0 ** (1 - k) / np.sqrt(15.0))))
+        a = np.float32(np.exp(-np.sqrt(2.0) / (SMOOTHING * np.sqrt(3.0) * 2.0 ** (1 - k) / np.sqrt(15.0))))
         for y in range(h):
             for x in range(1, w):
                 out[y, x] += a * right[y, x - 1] * (out[y, x - 1] - out[y, x])

@@ -6,10 +6,11 @@ import numpy as np
 from numba import njit
 
 REACH = 3  # pixels from which the colours on either side are taken
+CONTRAST = 3.0  # least difference of the two colours, in standard deviations of the subject's
 
 
 @njit(cache=True, nogil=True)
-def refine_outline(mask, image, mean, known, sigma, gain, offset, contrast):
+def refine_outline(mask, image, mean, known, sigma, gain, offset):
     """Decide the pixels on both sides of the outline by the subject's fraction of their colour.
 
     A pixel on the outline mixes the subject's colour F and the background's B, I = a F + (1 - a) B. B is known (shaded
@@ -22,9 +23,7 @@ def refine_outline(mask, image, mean, known, sigma, gain, offset, contrast):
     mask : (H, W) bool
     image : (H, W, 3) uint8
     mean, known, sigma, gain, offset
-        As in `background_evidence`.
-    contrast : float
-        Least difference of F and B, in standard deviations of F nearby.
+        As in `background_misfit`.
 
     Returns
     -------
@@ -75,6 +74,6 @@ def refine_outline(mask, image, mean, known, sigma, gain, offset, contrast):
                 spread -= front[c] * front[c]
                 step += (front[c] - back[c]) ** 2
                 fraction += (image[y, x, c] - back[c]) * (front[c] - back[c])
-            if step > max((6.0 * sigma[y, x]) ** 2, contrast * contrast * spread):
+            if step > max((6.0 * sigma[y, x]) ** 2, CONTRAST * CONTRAST * spread):
                 result[y, x] = fraction >= 0.5 * step
     return result

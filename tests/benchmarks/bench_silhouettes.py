@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from geomocap.silhouettes.background import model_from_plate
-from geomocap.silhouettes.extraction import silhouette
+from geomocap.silhouettes.joint_decision import silhouette
 from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 from tests.benchmarks.table import Row, measure
 from tests.geomocap.test_silhouettes import overlap, scene
