@@ -16,7 +16,6 @@ from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
-import open3d as o3d
 
 from geomocap.carving.carving_settings import HullSettings
 from geomocap.carving.hull import hull
@@ -26,6 +25,7 @@ from geomocap.carving.voxel_grid import Grid
 from geomocap.files.capture import Capture
 from geomocap.files.results import read_diagnostics, read_silhouette, read_skeleton
 from geomocap.files.run import Run
+from geomocap.model.ray_casting import TriangleScene
 from geomocap.model.rig import Rig
 from geomocap.model.self_check import SelfCheck
 from geomocap.skeleton.kinematics import BodyMotion
@@ -102,25 +102,22 @@ def check_result(
     for column, frame in enumerate(frames):
         seen = views(frame)
         placed = motion.part(slice(frame, frame + 1)).carry(mesh.skin.rest, mesh.skin.bodies, mesh.skin.fractions)[0]
-        scene = o3d.t.geometry.RaycastingScene()
-        corners, triangles = placed.astype(np.float32), mesh.surface.triangles.astype(np.uint32)
-        scene.add_triangles(o3d.core.Tensor.from_numpy(corners), o3d.core.Tensor.from_numpy(triangles))
+        scene = TriangleScene(placed, mesh.surface.triangles)
         for c in np.flatnonzero(~seen.blind()):
             model[c, column] = _drawn_overlap(scene, rig, seen, int(c))
         left_out[:, column] = _left_out_overlaps(seen, placed)
     return SelfCheck(tuple(cameras), np.asarray(frames), model, left_out, float(residual))
 
 
-def _drawn_overlap(scene: o3d.t.geometry.RaycastingScene, rig: Rig, views: PinholeViews, camera: int) -> float:
+def _drawn_overlap(scene: TriangleScene, rig: Rig, views: PinholeViews, camera: int) -> float:
     """Overlap of what is drawn into a camera with its silhouette."""
     width, height = (int(n) for n in rig.sizes[camera])
     shrunk = min(1.0, LONGEST_SIDE / max(width, height))
     size = max(1, round(shrunk * width)), max(1, round(shrunk * height))
-    K = rig.cameras[camera].calibration_matrix()
-    K = np.diag([size[0] / width, size[1] / height, 1.0]) @ K
-    pose = np.vstack([rig.cam_from_world[camera], [0, 0, 0, 1]])
-    rays = scene.create_rays_pinhole(o3d.core.Tensor.from_numpy(K), o3d.core.Tensor.from_numpy(pose), *size)
-    drawn = np.isfinite(scene.cast_rays(rays)["t_hit"].numpy())
+    x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
+    center, directions = rig.rays(camera, np.stack([x * width / size[0], y * height / size[1]], axis=-1).reshape(-1, 2))
+    rays = np.concatenate([np.broadcast_to(center, directions.shape), directions], axis=1)
+    drawn = scene.occluded(rays).reshape(x.shape)
     mask = _shrunk(views.masks[camera, :height, :width], size)
     return _overlap(drawn & _shrunk(views.valid[camera, :height, :width], size), mask)
 
