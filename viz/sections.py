@@ -8,7 +8,7 @@ import numpy as np
 import tomli_w
 
 from geomocap.files.check_file import read_self_check
-from geomocap.files.results import read_warnings
+from geomocap.files.results import read_diagnostics, read_warnings
 from viz.body_colors import body_color, hex_color
 from viz.quality_figures import Quality
 from viz.report import Block, Section, missing, table, text
@@ -91,6 +91,7 @@ def bodies_table(results: Results, frame: int) -> Block:
     """Return the table of bodies: their fraction of the points, ellipsoids and joints."""
     labels = results.bodies(frame).body
     e, s = results.ellipsoids, results.skeleton
+    sure = read_diagnostics(results.run).body_confidence
     count = int(max(labels.max(initial=-1), -1 if e is None else e.bodies.max(initial=-1))) + 1
     rows, colors = [], []
     for body in (*range(count), *([-1] if (labels < 0).any() else [])):
@@ -99,9 +100,11 @@ def bodies_table(results: Results, frame: int) -> Block:
         joints = ""
         if s is not None and body >= 0:
             joints = ", ".join(s.joint_names[j] for j in np.flatnonzero((s.joint_bodies == body).any(axis=1)).tolist())
-        rows.append((f"body {body}" if body >= 0 else "none", fraction, own, joints))
+        confidence = "" if sure is None or not 0 <= body < len(sure) else f"{sure[body]:.2f}"
+        rows.append((f"body {body}" if body >= 0 else "none", fraction, confidence, own, joints))
         colors.append(hex_color(body_color(body)))
-    return table(("body", f"points in frame {frame} (%)", "ellipsoids", "joints"), rows, (1, 2), colors)
+    head = ("body", f"points in frame {frame} (%)", "confidence", "ellipsoids", "joints")
+    return table(head, rows, (1, 2, 3), colors)
 
 
 def summary(quality: Quality) -> list[Block]:

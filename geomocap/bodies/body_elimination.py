@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geomocap.bodies.body_criteria import Candidate, Criterion, judge, judge_softness
+from geomocap.bodies.body_evidence import Candidate, Criterion, judge
 from geomocap.bodies.body_model import BodyModel, Evidence, reassign, refit, settle_rest
 
 _FURTHER = 4  # steps beyond the criterion, as alternatives
@@ -24,8 +23,8 @@ class EliminationStep:
         Number of bodies before the step.
     strength : float
         Of the weakest of them: the criterion would have to be this many times itself for that body to go.
-    turn_deg, excess_deg : float
-        Of the weakest body.
+    turn_deg, evidence : float
+        Of the weakest body, see `Candidate`.
     label : (N,) int32
         Body of each sample before the step.
     """
@@ -33,7 +32,7 @@ class EliminationStep:
     bodies: int
     strength: float
     turn_deg: float
-    excess_deg: float
+    evidence: float
     label: np.ndarray
 
 
@@ -58,36 +57,30 @@ class Elimination:
 def eliminate(model: BodyModel, evidence: Evidence, criterion: Criterion, count: int | None) -> Elimination:
     """Take away the weakest body until all are strong enough, or until a given number is left.
 
-    First by how bodies turn and what blends explain; among those that are left, by whether they are soft skin too.
+    Bodies are judged with places at rest of each sample's own: only motion is compared.
     """
     curve: list[EliminationStep] = []
-    if count is None:
-        model, evidence = _weaken(model, evidence, criterion, judge, None, curve)
-    model, evidence = _weaken(model, evidence, criterion, judge_softness, count, curve)
+    model, evidence = _weaken(model, evidence, criterion, count, curve)
     further = max(_LEAST_BODIES, len(np.unique(model.label)) - _FURTHER)
-    _weaken(model, evidence, criterion, judge_softness, further, curve)
+    _weaken(model, evidence, criterion, further, curve)
     return Elimination(model.compact(), evidence, tuple(curve))
 
 
 def _weaken(
-    model: BodyModel,
-    evidence: Evidence,
-    criterion: Criterion,
-    judged_by: Callable[[int, BodyModel, Evidence, Criterion], Candidate],
-    count: int | None,
-    curve: list[EliminationStep],
+    model: BodyModel, evidence: Evidence, criterion: Criterion, count: int | None, curve: list[EliminationStep]
 ) -> tuple[BodyModel, Evidence]:
-    """Take away the weakest body, as the judge has it, until `count` are left or, without one, all are strong."""
+    """Take away the weakest body until `count` are left or, without one, all are strong."""
     known: dict[int, Candidate] = {}
     while True:
         bodies = np.unique(model.label).tolist()
-        known = {b: known[b] if b in known else judged_by(b, model, evidence, criterion) for b in bodies}
+        loose = evidence.with_places_open()
+        known = {b: known[b] if b in known else judge(b, model, loose, criterion) for b in bodies}
         weakest = min(known.values(), key=lambda c: (c.strength, c.body))
         if curve and curve[-1].bodies == len(bodies):  # judged anew
             curve.pop()
-        turn_deg, excess_deg = float(np.rad2deg(weakest.turn)), float(np.rad2deg(weakest.excess))
         label = np.unique(model.label, return_inverse=True)[1].astype(np.int32)
-        curve.append(EliminationStep(len(bodies), weakest.strength, turn_deg, excess_deg, label))
+        turn_deg = float(np.rad2deg(weakest.turn))
+        curve.append(EliminationStep(len(bodies), weakest.strength, turn_deg, weakest.evidence, label))
         enough = weakest.strength >= 1.0 if count is None else len(bodies) <= count
         if enough or len(bodies) == 1 or not np.isfinite(weakest.strength):
             return model, evidence
@@ -95,6 +88,12 @@ def _weaken(
         model, evidence = remove(weakest, model, evidence)
         for stale in _changed(before, model, evidence):
             known.pop(stale, None)
+
+
+def confidences(model: BodyModel, evidence: Evidence, criterion: Criterion) -> np.ndarray:
+    """How sure it is that each body is one, (B,) float, 0 to 1, see `Candidate`."""
+    loose = evidence.with_places_open()
+    return np.array([judge(b, model, loose, criterion).confidence for b in range(model.count)])
 
 
 def _changed(before: BodyModel, after: BodyModel, evidence: Evidence) -> list[int]:

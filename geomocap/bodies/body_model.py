@@ -80,6 +80,10 @@ class Evidence:
         alone = (self.ray.any(axis=2) & self.seen).sum(axis=1) / np.maximum(self.seen.sum(axis=1), 1)
         return 1.0 - (1.0 - _BY_ONE) * alone
 
+    def with_places_open(self) -> Evidence:
+        """The same, no place in the reference being sure: each body may put a sample where it fits best."""
+        return replace(self, certain=np.zeros(len(self.rest), bool))
+
     def explain(
         self, samples: np.ndarray, model: BodyModel, allowed: np.ndarray, adjacent: np.ndarray, penalty: float
     ) -> Blends:

@@ -26,17 +26,12 @@ class MotionBodiesSettings(Settings):
         lt=180,
         description="the same where samples move with rigid parts, whose turns are known better (degrees)",
     )
-    min_excess_deg: float = Field(
-        default=3.5,
-        gt=0,
-        lt=90,
-        description="blends of its neighbours must miss a body's core by at least this, seen from its middle (degrees)",
-    )
     radius: float = Field(
         default=0.03,
         gt=0,
         lt=0.5,
-        description="surface around a sample that shows how it turns (fraction of the diagonal)",
+        description="surface around a sample that shows how it turns, more where noise asks for it (fraction of the "
+        "diagonal)",
     )
     first_cut_deg: float = Field(
         default=9.0, gt=0, lt=180, description="groups of samples that turn less differently are the start (degrees)"
@@ -53,8 +48,8 @@ class MotionBodiesSettings(Settings):
         default=0.18,
         ge=0,
         lt=1,
-        description="soft skin turns by a fixed part of what the bodies beside it do, to this fraction of it (0..1); "
-        "0 where samples move with rigid parts",
+        description="soft skin between two bodies differs from a blend of them by up to this fraction of how far they "
+        "carry it apart (0..1); 0 where samples move with rigid parts",
     )
     neighbours: int = Field(default=10, ge=4, description="neighbours of a sample on the surface")
     max_stretch: float = Field(

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from geomocap.bodies.body_criteria import Criterion
-from geomocap.bodies.body_elimination import EliminationStep, eliminate
+from geomocap.bodies.body_elimination import EliminationStep, confidences, eliminate
+from geomocap.bodies.body_evidence import Criterion
 from geomocap.bodies.body_model import BodyModel, Evidence, carry, model_of_labels, reassign, refit, settle_rest
 from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.bodies.connected_linkage import Dendrogram, connected_linkage
 from geomocap.bodies.local_rotations import local_rotations, turn_distances
+from geomocap.bodies.path_smoothing import smooth_paths
 from geomocap.bodies.surface_graph import SurfaceGraph, surface_graph
+from geomocap.bodies.surface_noise import SurfaceNoise, surface_noise
 from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths, sure_part
 from geomocap.progress import Progress, silent
@@ -23,7 +25,9 @@ _LEAST_SAMPLES = 20
 _CERTAIN = 0.3
 _SETTLE_ROUNDS = 3
 _EARLY_FRACTION = 0.8  # small groups may still grow
-_RADIUS = 0.05  # diagonals
+_FEIGNED = 7.81  # 95th percentile of χ² of the three angles of a turn by noise
+_ARM = 0.4  # radii
+_MOST_RADIUS = 3.0  # times the radius asked for
 _STAGE = "bodies"
 
 
@@ -32,7 +36,7 @@ class MotionBodies:
     """B rigid bodies of N samples over T frames.
 
     A body is a part of the surface that turns, somewhere in the sequence, at least `min_turn_deg` against each
-    neighbour, and whose core no blend of its neighbours explains.
+    neighbour, and explains more motion that these and blends of them do not than its freedoms cost.
 
     Attributes
     ----------
@@ -63,6 +67,11 @@ class MotionBodies:
     diagonal : float, metres
     unevenness : float, radians
         By which samples turn differently from those beside them, median: mostly how unsure the turns are.
+    confidence : (B,) float
+        How sure it is that each body is one, 0 to 1: 1/2 where its turn or evidence is just what is required, 2/3 where
+        it is twice that. Bodies of less are merged, unless their number was given.
+    noise : float, metres
+        Root mean square by which the surface around a sample misses where it goes: what is noise, and what is soft.
     """
 
     label: np.ndarray
@@ -79,6 +88,8 @@ class MotionBodies:
     linkage: Dendrogram
     diagonal: float
     unevenness: float
+    confidence: np.ndarray
+    noise: float
 
     @property
     def body_count(self) -> int:
@@ -109,9 +120,9 @@ def find_motion_bodies(
     Every sample's neighbourhood on the surface has a rotation since frame 0, whatever lever arms there are. Samples
     that turn alike are grouped (average linkage along the surface), too finely, unless the paths say which rigid parts
     they are of. Each group gets a rigid motion, each sample follows one body or a blend of two, and then the weakest
-    body goes, again and again, until each one left turns against its neighbours and is not explained by blends of
-    them. At last, parts of soft skin go, which turn by a fixed fraction of what bodies beside them do, and bodies of
-    too few samples. A rigid part was registered on its own: it is no skin, and its turn is known better.
+    body goes, again and again, until each one left turns against its neighbours and pays for its freedoms: it explains
+    motion that blends of the neighbours do not, beyond the noise that is everywhere on the surface and the softness of
+    skin (`body_evidence`). A rigid part was registered on its own: it is no skin, and its turn is known better.
 
     Parameters
     ----------
@@ -135,41 +146,68 @@ def find_motion_bodies(
     # Paths without gaps, the surface, and how it turns
     positions, certainty = complete_tracks(paths)
     weights = np.where(paths.seen, paths.weights(), 0.1 * certainty)
-    reference = positions[:, 0]  # of samples that are not seen there, as their neighbours carry them back
-    graph = surface_graph(positions, reference, settings.neighbours, settings.max_stretch)
+    smooth = smooth_paths(positions)
+    reference = smooth[:, 0]  # of samples that are not seen there, as their neighbours carry them back
+    graph = surface_graph(smooth, reference, settings.neighbours, settings.max_stretch)
+    noise = surface_noise(smooth, weights, reference, paths.ray, graph, diagonal)
     progress(_STAGE, 1, 4)
-    radius = max(settings.radius * diagonal, 2.5 * graph.spacing)
-    rotations = local_rotations(positions, reference, weights, graph.geodesics(radius), radius)
+    first_cut = np.deg2rad(settings.first_cut_deg)
+    geodesics, radius = _wide_enough(graph, noise, max(settings.radius * diagonal, 2.5 * graph.spacing), first_cut)
+    rotations = local_rotations(smooth, reference, weights, geodesics, radius)
     turns = turn_distances(_known_rotations(paths, rotations), certainty > _CERTAIN)
     progress(_STAGE, 2, 4)
     # Too many bodies
-    evidence = _evidence(positions, weights, paths, reference, turns, graph, diagonal, settings)
+    evidence = _evidence(smooth, weights, paths, reference, turns, graph, diagonal, settings)
     linkage = connected_linkage(turns, graph.neighbours)
     least = max(6, round(_EARLY_FRACTION * settings.min_fraction * paths.count))
-    first = linkage.cut(np.deg2rad(settings.first_cut_deg)) if paths.parts is None else paths.parts
-    label = absorb_small(first, turns, graph, least)
+    label = absorb_small(linkage.cut(first_cut) if paths.parts is None else paths.parts, turns, graph, least)
     if settings.bodies > int(label.max()) + 1:
         label = linkage.cut_count(settings.bodies)
-    model = reassign(model_of_labels(label, evidence), evidence, 4).compact()
-    if not evidence.certain.all():
-        for _ in range(_SETTLE_ROUNDS):
-            evidence = settle_rest(model, evidence)
-            model = reassign(refit(model, evidence, np.arange(model.count)), evidence, 1).compact()
+    model, evidence = _settled(reassign(model_of_labels(label, evidence), evidence, 4).compact(), evidence)
     progress(_STAGE, 3, 4)
     # Those that are there
-    criterion = _criterion(diagonal, settings, rigid=paths.parts is not None)
+    criterion = _criterion(settings, noise, rigid=paths.parts is not None)
     left = eliminate(model, evidence, criterion, settings.bodies or None)
     model = reassign(left.model, left.evidence, 3).compact()
+    confidence = confidences(model, left.evidence, criterion)
     progress(_STAGE, 4, 4)
-    return _result(model, left.evidence, paths, graph, left.curve, linkage, diagonal)
+    evidence = replace(left.evidence, positions=positions)
+    return _result(model, evidence, paths, graph, left.curve, linkage, diagonal, confidence, noise)
 
 
-def _criterion(diagonal: float, settings: MotionBodiesSettings, rigid: bool) -> Criterion:
+def _criterion(settings: MotionBodiesSettings, noise: SurfaceNoise, rigid: bool) -> Criterion:
     """When a body is one; rigid parts turn as a whole, and none that points suit on its own is a piece of soft skin."""
     turn, softness = (settings.part_turn_deg, 0.0) if rigid else (settings.min_turn_deg, settings.soft_fraction)
-    return Criterion(
-        np.deg2rad(turn), np.deg2rad(settings.min_excess_deg), _RADIUS * diagonal, settings.min_fraction, softness
-    )
+    return Criterion(np.deg2rad(turn), noise, settings.min_fraction, softness)
+
+
+def _wide_enough(graph: SurfaceGraph, noise: SurfaceNoise, radius: float, first_cut: float) -> tuple[np.ndarray, float]:
+    """Geodesics and radius of neighbourhoods so large that their turns by noise are less than those of the first cut.
+
+    Gaussian weights leave a disc of radius r an arm of 0.4 r about each axis, so that noise of standard deviation σ
+    turns n samples by σ / (√n 0.4 r) about it, and two such discs against each other by √2 times that.
+    """
+    most = _MOST_RADIUS * radius
+    while True:
+        geodesics = graph.geodesics(radius)
+        samples = float(np.median((geodesics <= radius).sum(axis=1)))
+        feigned = np.sqrt(_FEIGNED * 2.0 * noise.variance / 3.0 / samples) / (_ARM * radius)
+        if feigned < first_cut or 1.25 * radius > most:
+            return geodesics, radius
+        radius *= 1.25
+
+
+def _settled(model: BodyModel, evidence: Evidence) -> tuple[BodyModel, Evidence]:
+    """Places at rest from all frames, by the first bodies: frame 0 is as noisy as any other.
+
+    From then on all bodies carry the same shape; only samples that were not seen in frame 0, or not surely, may lie
+    elsewhere for another body.
+    """
+    for _ in range(_SETTLE_ROUNDS):
+        settled = settle_rest(model, evidence.with_places_open())
+        evidence = replace(evidence, rest=settled.rest)
+        model = reassign(refit(model, settled, np.arange(model.count)), settled, 1).compact()
+    return reassign(refit(model, evidence, np.arange(model.count)), evidence, 1).compact(), evidence
 
 
 def _known_rotations(paths: MotionPaths, fitted: np.ndarray) -> np.ndarray:
@@ -241,6 +279,8 @@ def _result(
     curve: tuple[EliminationStep, ...],
     linkage: Dendrogram,
     diagonal: float,
+    confidence: np.ndarray,
+    noise: SurfaceNoise,
 ) -> MotionBodies:
     memberships = model.memberships()
     carried = np.zeros_like(evidence.positions)
@@ -273,4 +313,6 @@ def _result(
         linkage,
         diagonal,
         float(np.median(evidence.unevenness)),
+        confidence,
+        float(np.sqrt(noise.variance)),
     )

@@ -20,6 +20,8 @@ class Diagnostics:
     sample_body : (N,) int
         Body of each, -1: none.
     sample_residuals : (N,) or (N, T) float
+    body_confidence : (B,) float
+        0 to 1: 1/2 where a body just pays for its freedoms, 2/3 where it pays twice.
     reliability : (T, B) float
         How well each body was measured in each frame.
     joint_costs : (J,) float, metres
@@ -52,6 +54,7 @@ class Diagnostics:
     sample_positions: np.ndarray | None = None
     sample_body: np.ndarray | None = None
     sample_residuals: np.ndarray | None = None
+    body_confidence: np.ndarray | None = None
     reliability: np.ndarray | None = None
     joint_costs: np.ndarray | None = None
     joint_is_hinge: np.ndarray | None = None

@@ -44,6 +44,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
         sample_positions=bodies.positions,
         sample_body=bodies.label,
         sample_residuals=bodies.residuals,
+        body_confidence=bodies.confidence,
         reliability=bodies.reliability,
         joint_costs=found.costs,
         joint_is_hinge=motion.joint_is_hinge,

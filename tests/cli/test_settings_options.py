@@ -68,7 +68,7 @@ def test_keys_without_a_flag_nested_tables_and_lists(tmp_path):
     [
         (["--contact_weight", "1"], r"takes no settings of the table \[motion_skeleton\]"),
         (["--refinement", "1"], r"takes no settings of the table \[refinement\]"),
-        (["--min-excess-deg", "2"], r"key min_excess_deg of the table \[motion_bodies\].*--set motion_bodies\.min"),
+        (["--first-cut-deg", "2"], r"key first_cut_deg of the table \[motion_bodies\].*--set motion_bodies\.first"),
         (["--tolerance", "2"], r"is the key tolerance of the table \[carving\.hull\]"),
         (["--nodes.colors", "false"], r"takes no settings of the table \[nodes\]"),
         (["--set", "carving.resolutoin=3"], r"no setting carving\.resolutoin; did you mean carving\.resolution\?"),

@@ -5,10 +5,12 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from geomocap.bodies.body_criteria import fixed_fraction, may_be_joined
 from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.bodies.motion_bodies import find_motion_bodies
+from geomocap.bodies.path_smoothing import smooth_paths
 from geomocap.bodies.point_labels import label_points
+from geomocap.bodies.surface_graph import surface_graph
+from geomocap.bodies.surface_noise import ring_misses, surface_noise
 from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.rotations import turn_angles
@@ -133,32 +135,79 @@ def test_deep_soft_skin_between_three_bodies_is_no_fourth(seed):
     assert same_partition(bodies.label[core], weights[core].argmax(axis=1)) > 0.97
 
 
-def test_fixed_fraction_of_a_turn():
-    rng = np.random.default_rng(9)
-    first = Rotation.from_rotvec(rng.normal(scale=0.4, size=(30, 3)))
-    turns = rng.normal(scale=0.4, size=(30, 3))
-    middle, second = first * Rotation.from_rotvec(0.3 * turns), first * Rotation.from_rotvec(turns)
-    fraction, miss, turn = fixed_fraction(first.as_matrix(), middle.as_matrix(), second.as_matrix())
-    assert fraction == pytest.approx(0.3)
-    assert miss < 1e-9
-    assert turn == pytest.approx(np.quantile(np.linalg.norm(turns, axis=1), 0.95))
-    other = first * Rotation.from_rotvec(rng.normal(scale=0.4, size=(30, 3)))
-    assert fixed_fraction(first.as_matrix(), other.as_matrix(), second.as_matrix())[1] > 0.3
+@pytest.mark.parametrize("shared", [False, True])
+def test_more_noise_gives_no_more_bodies(three, shared):
+    noise = np.random.default_rng(6).normal(size=three.positions.shape)
+    if shared:  # over 8 frames, and among samples within 40 mm
+        near = np.linalg.norm(three.positions[:, None, 0] - three.positions[None, :, 0], axis=2) / 0.04
+        noise = np.einsum("ij,jtc->itc", np.exp(-(near**2)), gaussian_filter1d(noise, 3.4, axis=1))
+    noise /= noise.std()
+    counts = []
+    for size in (0.002, 0.005, 0.01, 0.02, 0.05):  # metres, of boxes 0.12 m wide
+        bodies = find_motion_bodies(MotionPaths(three.positions + size * noise))
+        counts.append(bodies.body_count)
+        assert bodies.noise > 0.3 * size
+    assert counts[0] == 3
+    assert max(counts) == 3
 
 
-def test_what_turns_alike_elsewhere_is_not_joined(three):
-    rest = three.positions[three.body == 1, 0]
+def test_folds_of_cloth_are_no_bodies(three):
+    rest = three.positions[:, 0]
+    phase = 60.0 * rest[:, 0, None] + 40.0 * rest[:, 1, None] + 0.5 * np.arange(24)
+    folds = 0.012 * np.sin(phase)[..., None] * np.array([0.2, 0.6, 0.8])  # waves that run over the middle box
+    bodies = find_motion_bodies(MotionPaths(three.positions + (three.body == 1)[:, None, None] * folds))
+    assert bodies.body_count == 3
+    assert same_partition(bodies.label, three.body) > 0.9
 
-    def motion(b):
-        return three.rotations[:, b], three.translations[:, b]
 
-    for b in (0, 1, 2):
-        assert may_be_joined(rest, motion(1), motion(b), 0.01)
-    R, t = motion(1)
-    hinge = np.array([0.4, 0.0, 0.3])  # the same turns about an axis beside
-    assert not may_be_joined(rest, (R, t), (R, hinge - R @ hinge), 0.01)
-    still = np.tile(np.eye(3), (len(R), 1, 1)), np.zeros_like(t)
-    assert not may_be_joined(rest, (still[0], t), still, 0.01)
+def test_confidence_of_bodies(found, three):
+    assert found.confidence.shape == (3,)
+    assert (found.confidence > 0.6).all() and (found.confidence <= 1.0).all()
+    forced = find_motion_bodies(MotionPaths(three.positions), MotionBodiesSettings(bodies=4))
+    assert forced.confidence.min() < 0.5
+
+
+def test_misses_of_rings_are_those_of_numpy(three):
+    rng = np.random.default_rng(11)
+    positions = three.positions[:40] + rng.normal(scale=0.01, size=three.positions[:40].shape)
+    weights, rest = rng.random(positions.shape[:2]), three.positions[:40, 0]
+    ring = rng.random((40, 40)) < 0.4
+    misses = ring_misses(positions, weights, rest, ring)
+    for i in (0, 17, 39):
+        places, carried = [], []
+        for t in range(24):
+            w = weights[ring[i], t] / weights[ring[i], t].sum()
+            now, before = w @ positions[ring[i], t], w @ rest[ring[i]]
+            moments = (positions[ring[i], t] - now).T @ ((rest[ring[i]] - before) * w[:, None])
+            u, _, vt = np.linalg.svd(moments)
+            turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+            places.append(turn.T @ (positions[i, t] - now) + before)
+            carried.append((turn, now, before))
+        place = weights[i] @ np.array(places) / weights[i].sum()
+        expected = [positions[i, t] - (R @ (place - b) + a) for t, (R, a, b) in enumerate(carried)]
+        np.testing.assert_allclose(misses[i], expected, atol=1e-9)
+
+
+def test_noise_of_the_surface_is_what_was_added(three):
+    graph = surface_graph(three.positions, three.positions[:, 0], 10, 2.0)
+    weights = np.ones(three.positions.shape[:2])
+    for size in (0.0, 0.004):
+        positions = three.positions + np.random.default_rng(3).normal(scale=size, size=three.positions.shape)
+        noise = surface_noise(positions, weights, three.positions[:, 0], None, graph, 1.2)
+        per_axis = np.sqrt(noise.variance / 3.0)
+        assert per_axis == pytest.approx(max(size, 2.4e-4), rel=0.3, abs=1e-3)
+    # white noise: all samples count; noise in common: hardly more than one
+    places = three.positions[:60, 0]
+    assert noise.independent(places, 60) > 25
+    common = replace(noise, correlation=np.ones_like(noise.correlation))
+    assert common.independent(places, 60) == pytest.approx(1.0)
+
+
+def test_smoothing_of_paths_takes_white_noise_only(three):
+    np.testing.assert_allclose(smooth_paths(three.positions), three.positions, atol=5e-4)
+    noisy = three.positions + np.random.default_rng(3).normal(scale=0.01, size=three.positions.shape)
+    assert np.abs(smooth_paths(noisy) - three.positions).mean() < 0.8 * np.abs(noisy - three.positions).mean()
+    np.testing.assert_array_equal(smooth_paths(noisy[:, :5]), noisy[:, :5])
 
 
 def test_alternatives_have_other_numbers_of_bodies_nearest_first(found):

@@ -1,0 +1,233 @@
+"""When a body is one: it pays for its freedoms with motion that its neighbours and blends of them do not explain.
+
+A body that is added to a model has three more freedoms in each frame, its turn; a joint holds the rest. It has to
+explain so much that the likelihood of the samples grows by more than these freedoms are worth (Bayesian information
+criterion, Schwarz 1978). Both count for each freedom in time, so the length of a recording cancels:
+
+    1/2 n log[(s² + e² + c) / (s² + e² + o)]  >  3/2 log n
+
+n is the number of independent observations: neighbouring samples err together, and where one camera alone sees them
+they are two numbers and not three. c is the mean square by which bodies and blends without this one miss a sample, o
+that with it, where each may choose the place of the sample at rest: frame 0 is as noisy as any other, only motion is
+compared. s² is the noise that is everywhere on the surface, and e what soft skin between two bodies may differ from a
+blend of them: a fixed fraction of how far they carry it apart, but no more than the least turn of a body would move it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from geomocap.bodies.body_model import BodyModel, Evidence, carry
+from geomocap.bodies.rigid_motions import relative_turn
+from geomocap.bodies.surface_noise import SurfaceNoise
+
+_FREEDOMS = 3  # of a turn
+_FITTED = 6  # freedoms that were fitted to a body's own samples
+_MOST_SAMPLES = 80
+_MOST_NEIGHBOURS = 7
+_LEAST_CONTACTS = 3
+_LEAST_SEEN = 0.1
+_LEAST_SAMPLES = 3  # that tell a motion
+_LEAST_FRAMES = 5
+_TURN_FRACTION = 0.02  # of the frames, in which a turn may be larger
+# Noise turns n samples by three angles, each of variance s²/2 / (n radius²); with the 98th percentile of their χ²:
+_FEIGNED = 9.84 / 2.0
+_CLEARLY = np.deg2rad(40.0)
+_TIP_QUANTILE = 0.8
+_UNEVEN = np.deg2rad(10.0)  # samples side by side that turn more differently are unsure
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """When a body is one.
+
+    Attributes
+    ----------
+    min_turn : float, radians
+        It turns at least this much against each neighbour, beyond what noise feigns;
+    noise : SurfaceNoise
+        blends of its neighbours miss its samples by more than this noise and its freedoms are worth;
+    min_fraction : float
+        it has at least this fraction of the samples.
+    softness : float
+        Soft skin differs from a blend of two bodies by up to this fraction of how far these carry it apart.
+    """
+
+    min_turn: float
+    noise: SurfaceNoise
+    min_fraction: float
+    softness: float
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A body and what speaks for it.
+
+    Attributes
+    ----------
+    body : int
+    strength : float
+        The least of what speaks for it, as a fraction of what is required; below 1 it is no body.
+    into : int
+        Neighbour that turns most alike; -1: its samples go to blends of the neighbours.
+    turn : float, radians
+        Least turn against a neighbour, without what noise feigns.
+    evidence : float
+        What it explains over what its freedoms cost.
+    """
+
+    body: int
+    strength: float
+    into: int
+    turn: float
+    evidence: float
+
+    @property
+    def confidence(self) -> float:
+        """0 to 1: 1/2 where what speaks for the body is just what is required, 2/3 where it is twice that."""
+        return 1.0 if np.isinf(self.strength) else self.strength / (1.0 + self.strength)
+
+
+def judge(body: int, model: BodyModel, evidence: Evidence, criterion: Criterion) -> Candidate:
+    """What speaks for a body.
+
+    A body of too few samples goes, unless others hang together by it alone, as foot and trunk do by a leg that few
+    samples are on; its evidence must be greater by as much as it is too small.
+    """
+    contacts = model.contacts(evidence.adjacency)
+    neighbours = np.flatnonzero(contacts[body] >= _LEAST_CONTACTS)
+    members = np.flatnonzero(model.label == body)
+    if not len(neighbours) or not len(members):
+        return Candidate(body, np.inf, -1, np.inf, np.inf)
+    some = members
+    if len(members) > _MOST_SAMPLES:
+        some = members[np.linspace(0, len(members) - 1, _MOST_SAMPLES).astype(int)]
+    samples = criterion.noise.independent(evidence.rest[some], len(members)) * _coverage(evidence.seen[members])
+    observations = _directions(members, evidence) * samples
+    nats, own = _explained(body, neighbours, some, observations, model, evidence, criterion)
+    by_evidence = nats / (0.5 * _FREEDOMS * np.log(max(observations, np.e)))
+    # what noise feigns is no turn
+    inertia = max(samples, 1.0) * _square_radius(evidence.rest[members])
+    feigned = _FEIGNED * max(criterion.noise.variance, own) / max(inertia, 1e-12)
+    turns = [_turn(body, int(q), model, evidence) for q in neighbours]
+    turn = float(np.sqrt(max(min(turns) ** 2 - feigned, 0.0)))
+    by_turn, into = turn / criterion.min_turn, int(neighbours[int(np.argmin(turns))])
+    size = float(evidence.counts[members].sum()) / max(criterion.min_fraction * len(model.label), 1e-12)
+    if size < 1.0:
+        by_evidence *= size
+        if not _connects(body, neighbours, contacts):
+            return Candidate(body, min(0.5 * size, by_evidence, by_turn), into, turn, by_evidence)
+    return Candidate(body, min(by_evidence, by_turn), into if by_turn < by_evidence else -1, turn, by_evidence)
+
+
+def _explained(
+    body: int,
+    neighbours: np.ndarray,
+    some: np.ndarray,
+    observations: float,
+    model: BodyModel,
+    evidence: Evidence,
+    criterion: Criterion,
+) -> tuple[float, float]:
+    """Log likelihood that a body adds to that of its samples, in nats, and the mean square by which it misses them."""
+    reached = np.bincount(model.label[evidence.near[some].indices], minlength=model.count)
+    reached[body] = 0
+    reached[neighbours] += len(model.label)  # those that touch come first
+    others = np.argsort(-reached, kind="stable")[: min(_MOST_NEIGHBOURS, int((reached > 0).sum()))]
+    allowed = np.zeros((len(some), model.count), bool)
+    allowed[:, others] = True
+    beside = np.zeros((model.count, model.count), bool)
+    beside[np.ix_(neighbours, neighbours)] = True
+    without = evidence.explain(some, model, allowed, beside, 0.0)
+    row, main = np.arange(len(some)), without.costs.argmin(axis=1)
+    missed, partner, fraction = without.costs[row, main], without.partner[row, main], without.fraction[row, main]
+    allowed[:, body] = True
+    with_it = np.zeros_like(beside)
+    with_it[body] = with_it[:, body] = True
+    own = evidence.explain(some, model, allowed, with_it, 0.0).costs[:, body]
+    noise = np.maximum(criterion.noise.variance, 3.0 * evidence.sigma[some] ** 2)
+    if criterion.softness > 0:
+        apart = _spans(some, main, partner, model, evidence)
+        # a swing of the least turn to and fro moves what lies around its middle by the mean square a² r² / 3
+        soft = 4.0 * fraction * (1.0 - fraction) * criterion.softness**2 * apart
+        noise += np.minimum(soft, criterion.min_turn**2 / 3.0 * _square_radius(evidence.rest[some]))
+    # what was fitted to few independent observations leaves less than they really miss
+    fitted = observations / max(observations - _FITTED, 1.0)
+    gain = np.maximum(np.log((noise + missed) / (noise + fitted * own)), 0.0)
+    return 0.5 * observations * float(gain.mean()), float(own.mean())
+
+
+def _spans(some: np.ndarray, main: np.ndarray, partner: np.ndarray, model: BodyModel, evidence: Evidence) -> np.ndarray:
+    """Mean square by which the two bodies of their blends carry samples apart, (n,), metres²; 0 without a second."""
+    result = np.zeros(len(some))
+    for a, b in np.unique(np.stack([main, partner], axis=1), axis=0):
+        if b < 0:
+            continue
+        which = np.flatnonzero((main == a) & (partner == b))
+        rest = evidence.rest[some[which]]
+        apart = carry(model.rotations[a] - model.rotations[b], model.translations[a] - model.translations[b], rest)
+        result[which] = ((apart - apart.mean(axis=1, keepdims=True)) ** 2).sum(axis=2).mean(axis=1)
+    return result
+
+
+def _square_radius(places: np.ndarray) -> float:
+    """Mean square distance of samples (n, 3) from their middle, metres²."""
+    return float(((places - places.mean(axis=0)) ** 2).sum(axis=1).mean())
+
+
+def _coverage(seen: np.ndarray) -> float:
+    """Fraction of a body's samples (n, T) that are seen in a frame in which enough of them are to know its motion."""
+    known = seen.sum(axis=0) >= max(_LEAST_SAMPLES, _LEAST_SEEN * len(seen))
+    return float(seen[:, known].mean()) if known.any() else 0.0
+
+
+def _directions(members: np.ndarray, evidence: Evidence) -> float:
+    """Directions in which a position is sure, on average: 3, or 2 where one camera alone sees the sample."""
+    if evidence.ray is None:
+        return 3.0
+    seen = evidence.seen[members]
+    return 3.0 - float((evidence.ray[members].any(axis=2) & seen).sum() / max(seen.sum(), 1))
+
+
+def _turn(first: int, second: int, model: BodyModel, evidence: Evidence) -> float:
+    """Turn of two bodies against each other: mean of that of their motions and of their most different parts.
+
+    Where samples side by side turn so differently that they are unsure, that of the motions counts more.
+    """
+    known = _seen(first, model, evidence) & _seen(second, model, evidence)
+    if known.sum() < min(_LEAST_FRAMES, len(known)):
+        known[:] = True
+    one, other = model.rotations[first, known], model.rotations[second, known]
+    if min(evidence.seen[model.label == body, 0].sum() for body in (first, second)) < 3:
+        # nothing ties the body to frame 0: its turn counts from the middle of the frames
+        at = len(one) // 2
+        return relative_turn(one @ one[at].T, other @ other[at].T, _TURN_FRACTION)
+    turn = relative_turn(one, other, _TURN_FRACTION)
+    if turn > _CLEARLY:
+        return turn
+    a = np.flatnonzero((model.label == first) & model.core)
+    b = np.flatnonzero((model.label == second) & model.core)
+    if min(len(a), len(b)) < 4:
+        return turn
+    tips = float(np.quantile(evidence.turns[np.ix_(a, b)], _TIP_QUANTILE))
+    uneven = np.sqrt(np.mean([np.median(evidence.unevenness[some]) ** 2 for some in (a, b)]))
+    fraction = 0.5 * min(1.0, (_UNEVEN / max(float(uneven), 1e-9)) ** 2)
+    return (1.0 - fraction) * turn + fraction * tips
+
+
+def _seen(body: int, model: BodyModel, evidence: Evidence) -> np.ndarray:
+    """Frames in which enough samples of a body are seen to know its motion, (T,) bool."""
+    seen = evidence.seen[model.label == body]
+    return seen.sum(axis=0) >= max(_LEAST_SAMPLES, _LEAST_SEEN * len(seen))
+
+
+def _connects(body: int, neighbours: np.ndarray, contacts: np.ndarray) -> bool:
+    """Whether the bodies beside it hang together by this one only."""
+    touching = contacts >= _LEAST_CONTACTS
+    touching[body] = touching[:, body] = False
+    part = connected_components(csr_matrix(touching), directed=False)[1]
+    return len(np.unique(part[neighbours])) > 1

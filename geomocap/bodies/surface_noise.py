@@ -1,0 +1,164 @@
+"""What a moving surface misses of rigid motion everywhere: noise of its positions, and how samples fraction it.
+
+The motion of the samples in a ring around a sample, a little wider than the smallest body, predicts where that sample
+goes. What it misses is noise of the positions, white or shared with those nearby, and what the surface gives; at joints
+it is motion, too. Noise is everywhere and joints are not: the quarter of the samples that are predicted best tell how
+large it is, whatever the subject. The misses also tell how far samples err together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from geomocap.bodies.surface_graph import SurfaceGraph, frames_looked_at
+from geomocap.model.motion_paths import sure_part
+from geomocap.model.rotations import nearest_rotation
+
+_RING = (0.03, 0.06)  # diagonals; a disc of the inner radius is about a hundredth of the surface of a person
+_SPACINGS = 5.0  # the ring's outer radius is at least so many times the distance of neighbours
+_QUANTILE = 0.25
+_GIVE = 2e-4  # diagonals; no surface is followed more exactly
+_FRAMES = 40
+_LEAST = 4  # samples in a ring
+_BINS = 64
+_BIN = 1.5  # spacings
+
+
+@dataclass(frozen=True)
+class SurfaceNoise:
+    """Noise of the positions of samples.
+
+    Attributes
+    ----------
+    variance : float, metres²
+        Mean square distance by which a sample is missed, all three directions together.
+    correlation : (K,) float
+        Of the misses of two samples, by their distance; 0 from the first zero on.
+    step : float, metres
+        Distances of `correlation` are 0 to 1, 1 to 2, … times this.
+    """
+
+    variance: float
+    correlation: np.ndarray
+    step: float
+
+    def independent(self, places: np.ndarray, count: int) -> float:
+        """Effective number of samples that err on their own, of `count` that lie as `places` (n, 3), metres, do.
+
+        The square of their number over the sum of the correlations of all pairs.
+        """
+        apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+        shared = self.correlation[np.minimum((apart / self.step).astype(int), len(self.correlation) - 1)]
+        pairs = max(len(places) * (len(places) - 1), 1)
+        mean = (shared.sum() - np.trace(shared)) / pairs
+        return float(count / (1.0 + (count - 1) * mean))
+
+
+def surface_noise(
+    positions: np.ndarray,
+    weights: np.ndarray,
+    reference: np.ndarray,
+    ray: np.ndarray | None,
+    graph: SurfaceGraph,
+    diagonal: float,
+) -> SurfaceNoise:
+    """Noise of samples, by what rings around them miss of their motion.
+
+    Parameters
+    ----------
+    positions, weights : (N, T, 3) float, metres; (N, T) float
+        Complete; weights of what was not seen are small.
+    reference : (N, 3) float, metres
+    ray : (N, T, 3) float, optional
+        See `MotionPaths`; what is missed along it counts a tenth.
+    graph : SurfaceGraph
+    diagonal : float, metres
+    """
+    looked_at = frames_looked_at(positions.shape[1], _FRAMES)
+    positions, weights = np.ascontiguousarray(positions[:, looked_at]), np.ascontiguousarray(weights[:, looked_at])
+    outer = max(_RING[1] * diagonal, _SPACINGS * graph.spacing)
+    geodesics = graph.geodesics(outer)
+    ring = (geodesics <= outer) & (geodesics > outer * _RING[0] / _RING[1])
+    misses = ring_misses(positions, weights, reference, ring)
+    misses = sure_part(misses, None if ray is None else ray[:, looked_at])
+    known = ring.sum(axis=1) >= _LEAST
+    step = _BIN * graph.spacing
+    give = 3.0 * (_GIVE * diagonal) ** 2
+    if not known.any():
+        return SurfaceNoise(give, np.zeros(_BINS), step)
+    misses, weights = misses[known], weights[known]
+    square = (weights * (misses**2).sum(axis=2)).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-12)
+    correlation = _correlation((np.sqrt(weights)[..., None] * misses).reshape(len(misses), -1), reference[known], step)
+    return SurfaceNoise(max(float(np.quantile(square, _QUANTILE)), give), correlation, step)
+
+
+def _correlation(misses: np.ndarray, places: np.ndarray, step: float) -> np.ndarray:
+    """Mean cosine of misses (n, M) of pairs of samples by their distance, (K,), 0 from its first zero on."""
+    length = np.linalg.norm(misses, axis=1) + 1e-12
+    cosines = (misses @ misses.T) / np.outer(length, length)
+    apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+    pairs = np.triu_indices(len(misses), 1)
+    bins = np.minimum((apart[pairs] / step).astype(int), _BINS - 1)
+    number = np.bincount(bins, minlength=_BINS)
+    mean = np.bincount(bins, cosines[pairs], _BINS) / np.maximum(number, 1)
+    over = np.flatnonzero((mean <= 0) & (number > 0))
+    mean[over[0] if len(over) else _BINS - 1 :] = 0.0
+    return np.clip(mean, 0.0, 1.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _moments_of(i, positions, weights, reference, first, members, center, start, moments):
+    """Fill row i: weighted means of a ring now and at rest, and the moments about these."""
+    for t in range(weights.shape[1]):
+        total = 1e-12
+        for q in range(first[i], first[i + 1]):
+            j = members[q]
+            total += weights[j, t]
+            for c in range(3):
+                center[i, t, c] += weights[j, t] * positions[j, t, c]
+                start[i, t, c] += weights[j, t] * reference[j, c]
+        for c in range(3):
+            center[i, t, c] /= total
+            start[i, t, c] /= total
+        for q in range(first[i], first[i + 1]):
+            j = members[q]
+            w = weights[j, t] / total
+            for a in range(3):
+                moved = w * (positions[j, t, a] - center[i, t, a])
+                for b in range(3):
+                    moments[i, t, a, b] += moved * (reference[j, b] - start[i, t, b])
+
+
+@numba.njit(cache=True, nogil=True, parallel=True)
+def _ring_moments(positions, weights, reference, first, members, center, start, moments):
+    for i in numba.prange(len(weights)):
+        _moments_of(np.int64(i), positions, weights, reference, first, members, center, start, moments)
+
+
+def ring_misses(positions: np.ndarray, weights: np.ndarray, reference: np.ndarray, ring: np.ndarray) -> np.ndarray:
+    """By what the motion of the ring around each sample misses it, from the place at rest that suits it best.
+
+    Parameters
+    ----------
+    positions, weights : (N, T, 3) float, metres; (N, T) float
+    reference : (N, 3) float, metres
+    ring : (N, N) bool
+        Row i: samples of the ring around sample i.
+
+    Returns
+    -------
+    (N, T, 3) float, metres
+    """
+    members = np.nonzero(ring)[1]
+    first = np.concatenate([[0], np.cumsum(ring.sum(axis=1))])
+    center, start = np.zeros_like(positions), np.zeros_like(positions)
+    moments = np.zeros((*weights.shape, 3, 3))
+    _ring_moments(positions, weights, np.ascontiguousarray(reference), first, members, center, start, moments)
+    rotations = nearest_rotation(moments + 1e-12 * np.eye(3))
+    away = ((positions - center)[:, :, None] @ rotations)[:, :, 0] + start
+    fraction = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
+    place = (fraction[:, :, None] * away).sum(axis=1)[:, None] - start
+    return positions - center - (rotations @ place[..., None])[..., 0]
