@@ -149,7 +149,10 @@ def _explained(
     with_it = np.zeros_like(beside)
     with_it[body] = with_it[:, body] = True
     own = evidence.explain(some, model, allowed, with_it, 0.0).costs[:, body]
-    noise = np.maximum(criterion.noise.variance, 3.0 * evidence.sigma[some] ** 2)
+    stated = 3.0 * evidence.sigma[some] ** 2
+    if evidence.ray is not None:  # what one camera alone sees is as unsure as its depth says, which hardly counts
+        stated[evidence.ray[some].any(axis=(1, 2))] = 0.0
+    noise = np.maximum(criterion.noise.variance, stated)
     if criterion.softness > 0:
         apart = _spans(some, main, partner, model, evidence)
         # a swing of the least turn to and fro moves what lies around its middle by the mean square a² r² / 3

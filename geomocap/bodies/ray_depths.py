@@ -59,23 +59,23 @@ def find_bodies_and_depths(
 ) -> tuple[MotionBodies, MotionPaths]:
     """Find bodies, from their motions the depths of what single cameras see, and bodies from these; again and again.
 
-    Wrong depths tear bodies into pieces. So of the first bodies and those of `depth_rounds` further rounds the fewest
-    are taken, the latest of equally many. Parameters and errors are those of `find_motion_bodies`. Also returns the
-    paths that the bodies are of.
+    Wrong depths make a surface that no rigid bodies move. So of the first bodies and those of `depth_rounds` further
+    rounds those are taken whose paths show the least noise, the latest of equals. Parameters and errors are those of
+    `find_motion_bodies`. Also returns the paths that the bodies are of.
     """
     settings = settings or MotionBodiesSettings()
     rounds = settings.depth_rounds if paths.ray is not None and paths.ray.any() else 0
     progress(_STAGE, 0, 1 + rounds)
     bodies = find_motion_bodies(paths, settings)
     progress(_STAGE, 1, 1 + rounds)
-    fewest = bodies, paths
+    best = bodies, paths
     for k in range(rounds):
-        settled = settle_depths(paths, bodies)
-        bodies = find_motion_bodies(settled, settings)
-        if bodies.body_count <= fewest[0].body_count:
-            fewest = bodies, settled
+        paths = settle_depths(paths, bodies)
+        bodies = find_motion_bodies(paths, settings)
+        if bodies.noise <= best[0].noise:
+            best = bodies, paths
         progress(_STAGE, 2 + k, 1 + rounds)
-    return fewest
+    return best
 
 
 def settle_depths(paths: MotionPaths, bodies: MotionBodies) -> MotionPaths:

@@ -1,4 +1,4 @@
-"""What a moving surface misses of rigid motion everywhere: noise of its positions, and how samples fraction it.
+"""What a moving surface misses of rigid motion everywhere: noise of its positions, and how samples share it.
 
 The motion of the samples in a ring around a sample, a little wider than the smallest body, predicts where that sample
 goes. What it misses is noise of the positions, white or shared with those nearby, and what the surface gives; at joints
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
+from geomocap.bodies.rigid_motions import fit_rigid_motion
 from geomocap.bodies.surface_graph import SurfaceGraph, frames_looked_at
 from geomocap.model.motion_paths import sure_part
 from geomocap.model.rotations import nearest_rotation
@@ -23,6 +24,8 @@ _QUANTILE = 0.25
 _GIVE = 2e-4  # diagonals; no surface is followed more exactly
 _FRAMES = 40
 _LEAST = 4  # samples in a ring
+_ASKED = 300  # samples whose rings are asked, where rays make that slow
+_ROUNDS = 2
 _BINS = 64
 _BIN = 1.5  # spacings
 
@@ -82,9 +85,17 @@ def surface_noise(
     outer = max(_RING[1] * diagonal, _SPACINGS * graph.spacing)
     geodesics = graph.geodesics(outer)
     ring = (geodesics <= outer) & (geodesics > outer * _RING[0] / _RING[1])
-    misses = ring_misses(positions, weights, reference, ring)
-    misses = sure_part(misses, None if ray is None else ray[:, looked_at])
     known = ring.sum(axis=1) >= _LEAST
+    if ray is None or not ray.any():
+        misses = ring_misses(positions, weights, reference, ring)
+    else:
+        ray = np.ascontiguousarray(ray[:, looked_at])
+        asked = np.flatnonzero(known)[:: max(1, int(known.sum()) // _ASKED)]
+        known = np.isin(np.arange(len(known)), asked)
+        misses = np.zeros_like(positions)
+        for i in asked:
+            misses[i] = _miss_across(i, np.flatnonzero(ring[i]), positions, weights, reference, ray)
+        misses = sure_part(misses, ray)
     step = _BIN * graph.spacing
     give = 3.0 * (_GIVE * diagonal) ** 2
     if not known.any():
@@ -107,6 +118,17 @@ def _correlation(misses: np.ndarray, places: np.ndarray, step: float) -> np.ndar
     over = np.flatnonzero((mean <= 0) & (number > 0))
     mean[over[0] if len(over) else _BINS - 1 :] = 0.0
     return np.clip(mean, 0.0, 1.0)
+
+
+def _miss_across(
+    i: int, members: np.ndarray, positions: np.ndarray, weights: np.ndarray, reference: np.ndarray, ray: np.ndarray
+) -> np.ndarray:
+    """By what the motion of a ring misses a sample, (T, 3), where rays leave depths open."""
+    motion = fit_rigid_motion(positions[members], reference[members], weights[members], 0.0, _ROUNDS, ray[members])
+    rotations, translations = motion[:2]
+    away = ((positions[i] - translations)[:, None] @ rotations)[:, 0]
+    place = (weights[i, :, None] * away).sum(axis=0) / max(float(weights[i].sum()), 1e-12)
+    return positions[i] - translations - rotations @ place
 
 
 @numba.njit(cache=True, nogil=True)
