@@ -77,16 +77,20 @@ def merge_bodies(run: Path, into: Path, joint: int) -> Path:
     """Copy a run, with the two bodies of a joint made one."""
     skeleton = _copy(run, into)
     kept, gone = skeleton["joint_bodies"][joint]
+    number = np.arange(skeleton["body_rotations"].shape[1] + 1)  # the last: of points without a body
+    number[gone] = kept
+    number = np.where(number > gone, number - 1, number)
+    number[-1] = -1
     for file in (into / "bodies").glob("*.ply"):
-        label = _labelled(file)[1]
-        _relabel(file, np.where(label == gone, kept, label))
-    bodies = np.where(skeleton["joint_bodies"] == gone, kept, skeleton["joint_bodies"])
+        _relabel(file, number[_labelled(file)[1]])
+    bodies = number[skeleton["joint_bodies"]]
     np.savez(
         into / "skeleton.npz",
         joint_positions=np.delete(skeleton["joint_positions"], joint, axis=1),
         joint_bodies=np.delete(bodies, joint, axis=0),
         joint_names=np.delete(skeleton["joint_names"], joint),
-        **{name: skeleton[name] for name in ("body_rotations", "body_positions", "fps")},
+        **{name: np.delete(skeleton[name], gone, axis=1) for name in ("body_rotations", "body_positions")},
+        fps=skeleton["fps"],
     )
     return into
 

@@ -29,7 +29,7 @@ class Panel:
     def __init__(self, gui: Any, subject: Subject) -> None:
         self._gui, self._subject = gui, subject
         self.playing = False
-        gui.configure_theme(show_logo=False, show_fraction_button=False, brand_color=(20, 110, 230))
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(20, 110, 230))
         gui.main_panel.dock_right()
         gui.main_panel.set_width(380)
         gui.add_markdown(HELP)

@@ -58,7 +58,9 @@ def test_one_frame_with_and_without_silhouettes(tmp_path: Path, masks: bool) -> 
     assert record is not None and record.frames == 1 and record.points == len(points)
     assert record.reasons["matched"] == len(points) and not record.warnings
     # The same frame measured again is the same
-    again, _ = measure_again(run, capture, load_config(overrides=COARSE).cloud, 0)
+    again = measure_again(run, capture, 0)
+    assert again is not None
+    again, _ = again
     np.testing.assert_allclose(again.points.positions, points, atol=1e-6)
 
 
