@@ -5,6 +5,8 @@ public and stays: it changes only with a line in the changelog and a version in 
 functions take and return values; only those that name a folder read or write files. They are loaded when they are used
 first, so that `import geomocap` is quick.
 
+Examples
+--------
 >>> import geomocap, numpy as np
 >>> tracks = np.zeros((500, 60, 3))                  # yours: points, frames, metres; NaN where unseen
 >>> motion = geomocap.find_motion(tracks, fps=30)    # doctest: +SKIP
@@ -35,7 +37,9 @@ if TYPE_CHECKING:
     from geomocap.model.motion_paths import MotionPaths
     from geomocap.model.rig import Rig
     from geomocap.motion import Motion, MotionSettings, find_motion
+    from geomocap.patches.point_tracking import track
     from geomocap.segmentation.m3 import segment_m3
+    from geomocap.silhouettes.silhouette_scene import find_silhouettes
     from geomocap.skeleton.m3_skeleton import skeleton_m3
     from geomocap.subject.model_building import build_model
     from geomocap.subject.model_following import follow_model
@@ -55,6 +59,8 @@ _HOMES = {  # where each public name is defined
     "evaluate": "geomocap.evaluation.run_evaluation",
     "export_run": "geomocap.export.run_export",
     "find_motion": "geomocap.motion",
+    "find_silhouettes": "geomocap.silhouettes.silhouette_scene",
+    "track": "geomocap.patches.point_tracking",
     "follow_model": "geomocap.subject.model_following",
     "measure_cloud": "geomocap.dense.dense_frame",
     "open_capture": "geomocap.files.capture",
@@ -79,6 +85,7 @@ __all__ = [
     "evaluate",
     "export_run",
     "find_motion",
+    "find_silhouettes",
     "follow_model",
     "measure_cloud",
     "open_capture",
@@ -86,6 +93,7 @@ __all__ = [
     "read_model",
     "segment_m3",
     "skeleton_m3",
+    "track",
     "working_volume",
 ]
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial, reduce
-from operator import add
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from geomocap.carving.holes import fill_false_holes
-from geomocap.carving.silhouette_views import Undistortion
 from geomocap.errors import CaptureError
 from geomocap.files.atomic import write_atomic
 from geomocap.files.capture import Capture
@@ -20,13 +17,10 @@ from geomocap.files.run import Run, stage_key
 from geomocap.pipeline.job import Job
 from geomocap.scheduling import map_items
 from geomocap.silhouettes.background import BackgroundModel, model_from_frames, model_from_plate
-from geomocap.silhouettes.joint_decision import CameraEvidence, decide, learn_from
-from geomocap.silhouettes.likelihood import Counts, Likelihood
-from geomocap.silhouettes.other_cameras import OtherCameras
+from geomocap.silhouettes.likelihood import Counts
 from geomocap.silhouettes.region import region_of_points
+from geomocap.silhouettes.silhouette_scene import SilhouetteScene, learning_frames
 from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
-
-LEARNING_FRAMES = 6  # spread over the capture
 
 
 def silhouettes(job: Job) -> str:
@@ -51,25 +45,21 @@ def _make_silhouettes(job: Job, capture: Capture) -> int:
     ]
     task: Callable[[int], None] = _Copy(capture, job.run)
     if missing and not capture.has_masks:
-        task = _Cut(job.run, learn_scene(job))
+        task = _Cut(capture, job.run, learn_scene(job, capture))
     for _ in map_items(task, missing, job.executor, "silhouettes", job.progress, 4):
         pass
     return len(missing) * len(capture.cameras)
 
 
-def learn_scene(job: Job) -> LearntScene:
+def learn_scene(job: Job, capture: Capture) -> SilhouetteScene:
     """Learn what the cameras see without the subject, and how subject and background differ."""
-    capture, settings = job.capture, job.config.silhouettes
-    assert capture is not None
-    learn = _Learn(capture, settings)
-    models = tuple(map_items(learn, capture.cameras, job.executor, "background", job.progress, 2))
-    others = OtherCameras.of(capture.rig) if settings.joint and capture.is_calibrated and len(models) > 1 else None
-    undistortion = Undistortion.of(capture.rig) if others is not None else None
-    unlearnt = Likelihood.unlearnt(len(models))
-    scene = LearntScene(capture, settings, models, _regions(capture), others, undistortion, unlearnt)
-    some = np.unique(np.linspace(0, capture.n_frames - 1, min(LEARNING_FRAMES, capture.n_frames)).round().astype(int))
-    counts = list(map_items(scene.learn, some.tolist(), job.executor, "likelihood", job.progress, 4))
-    return replace(scene, likelihood=Likelihood.of(reduce(add, counts)))
+    settings = job.config.silhouettes
+    models = list(map_items(_Learn(capture, settings), capture.cameras, job.executor, "background", job.progress, 2))
+    regions = _regions(capture)
+    rig = capture.rig if capture.is_calibrated else None
+    scene = SilhouetteScene.unlearnt(models, rig, settings, [regions.get(c) for c in capture.cameras])
+    some = learning_frames(capture.n_frames)
+    return scene.learnt(map_items(_Count(capture, scene), some, job.executor, "likelihood", job.progress, 4))
 
 
 @dataclass(frozen=True)
@@ -90,47 +80,28 @@ class _Learn:
 
 
 @dataclass(frozen=True)
-class LearntScene:
-    """What the silhouettes of any frame need."""
+class _Count:
+    """What the images of one frame tell about subject and background."""
 
     capture: Capture
-    settings: SilhouetteSettings
-    models: tuple[BackgroundModel, ...]
-    regions: dict[str, np.ndarray]
-    others: OtherCameras | None
-    undistortion: Undistortion | None
-    likelihood: Likelihood
+    scene: SilhouetteScene
 
-    def views(self, frame: int) -> list[CameraEvidence]:
-        """Read the images of a frame and compare them with the background."""
-        shadows = bool(np.isfinite(self.likelihood.shadow).any())
-        return [
-            CameraEvidence.of(self.capture.frame(c, frame), model, self.settings, self.regions.get(c), shadows)
-            for c, model in zip(self.capture.cameras, self.models, strict=True)
-        ]
-
-    def learn(self, frame: int) -> Counts:
-        """Count what a frame tells about subject and background."""
-        return learn_from(self.views(frame), self.others, self.settings)
-
-    def silhouettes(self, frame: int) -> tuple[np.ndarray, ...]:
-        """Cut out a frame's silhouettes, C arrays (H, W) bool."""
-        masks = decide(self.views(frame), self.likelihood, self.others, self.settings).masks
-        if self.undistortion is None:
-            return masks
-        given = [m.astype(np.uint8) * np.uint8(255) for m in masks]
-        return tuple(m > 0 for m in fill_false_holes(self.capture.rig, self.undistortion.views(given), given))
+    def __call__(self, frame: int) -> Counts:
+        return self.scene.count([self.capture.frame(c, frame) for c in self.capture.cameras])
 
 
 @dataclass(frozen=True)
 class _Cut:
     """Silhouettes of one frame, written to the run."""
 
+    capture: Capture
     run: Run
-    scene: LearntScene
+    scene: SilhouetteScene
 
     def __call__(self, frame: int) -> None:
-        for camera, mask in zip(self.scene.capture.cameras, self.scene.silhouettes(frame), strict=True):
+        cameras = self.capture.cameras
+        masks = self.scene.silhouettes([self.capture.frame(c, frame) for c in cameras])
+        for camera, mask in zip(cameras, masks, strict=True):
             write_atomic(self.run.silhouette_file(camera, frame), partial(_write_mask, mask * np.uint8(255)))
 
 

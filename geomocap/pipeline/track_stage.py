@@ -16,17 +16,14 @@ from geomocap.files.results import read_silhouette, write_tracks
 from geomocap.files.run import Run, stage_key
 from geomocap.files.scans import point_spacing
 from geomocap.model.frame_geometry import Voxels
-from geomocap.model.trajectories import Tracks
 from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.patch_settings import TrackingSettings
-from geomocap.patches.patch_tracking import track_surface
+from geomocap.patches.point_tracking import track_points
 from geomocap.patches.seeding import image_reduction
 from geomocap.pipeline.cloud_stage import clouds
 from geomocap.pipeline.derived import KEYPOINT_FILES
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.voxel_stage import voxels
-from geomocap.trajectories.filters import filter_trajectories
-from geomocap.trajectories.smoothing import smooth_motion
 
 _CLOSED = 1.8  # edge of the voxels of a cloud, as a multiple of its spacing: without holes
 
@@ -50,17 +47,9 @@ def tracks(job: Job) -> str:
 
 
 def _track(job: Job, capture: Capture) -> int:
-    read = frame_reader(capture, job.run, job.config.tracking)
-    found = track_surface(read, capture.n_frames, job.config.tracking, job.progress, job.executor)
-    unfiltered = found.positions.astype(np.float32)
-    # nothing is held longer than it is needed: long recordings have many trajectories
-    filtered = filter_trajectories(
-        found, smooth_motion(found.positions, job.fps, found.sigma, job.config.smoothing), job.config.filters
-    )
-    del found
-    kept = filtered.trajectories
-    motion = smooth_motion(kept.positions, job.fps, kept.sigma, job.config.smoothing)
-    write_tracks(job.run, Tracks(kept, motion, unfiltered, filtered.kept))
+    config, read = job.config, frame_reader(capture, job.run, job.config.tracking)
+    parts = (config.tracking, config.filters, config.smoothing)
+    write_tracks(job.run, track_points(read, capture.n_frames, job.fps, *parts, job.progress, job.executor))
     return capture.n_frames
 
 

@@ -12,7 +12,8 @@ from numpy.testing import assert_array_equal
 import geomocap
 from geomocap.carving.carving_settings import CarvingSettings
 from geomocap.errors import CaptureError, GeometryError
-from tests.geomocap.ball import RADIUS, Texture, off_surface, photograph, ring
+from geomocap.patches.patch_settings import TrackingSettings
+from tests.geomocap.ball import HEIGHT, RADIUS, WIDTH, Texture, off_surface, photograph, ring
 from tests.geomocap.moving_chains import chain, same_partition
 
 
@@ -80,3 +81,30 @@ def test_one_frame_of_a_ball_is_carved_and_measured():
 def test_a_capture_that_is_none_is_refused_in_one_line(tmp_path):
     with pytest.raises(CaptureError, match=r"capture\.toml"):
         geomocap.open_capture(tmp_path)
+
+
+def test_silhouettes_of_a_ball_and_tracks_of_its_surface():
+    rig = ring(8, 360.0)
+    images, masks = photograph(rig, Texture.random())
+    walls = [wall(rig, c) for c in range(len(rig))]
+    found = geomocap.find_silhouettes([images, images], rig, backgrounds=walls)
+    for mask, true in zip(found[0], masks, strict=True):
+        assert (mask & true).sum() / (mask | true).sum() > 0.97  # the outline is right to a pixel
+    volume = geomocap.carve(masks, rig, images=images, settings=CarvingSettings(resolution=64))
+    settings = TrackingSettings(n_patches=200)
+    tracks = geomocap.track([images] * 3, [masks] * 3, [volume] * 3, rig, fps=30, settings=settings)
+    moved = tracks.trajectories.positions[:, 2] - tracks.trajectories.positions[:, 0]
+    assert len(moved) > 50 and np.nanmedian(np.linalg.norm(moved, axis=1)) < 1e-4  # metres: it stands still
+
+
+def wall(rig, camera):
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    _, d = rig.rays(camera, np.column_stack([x.ravel(), y.ravel()]))
+    grey = 60 + 30 * d[:, 2] + np.random.default_rng(camera).normal(0, 1, len(d))
+    return np.repeat(np.clip(np.rint(grey), 0, 255).astype(np.uint8).reshape(HEIGHT, WIDTH, 1), 3, axis=2)
+
+
+def test_silhouettes_of_cameras_that_do_not_fit_are_refused():
+    image = np.zeros((8, 8, 3), np.uint8)
+    with pytest.raises(CaptureError, match="2 images a frame"):
+        geomocap.find_silhouettes([[image, image]], backgrounds=[image])
