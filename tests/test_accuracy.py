@@ -73,6 +73,10 @@ CASES = {
     # Index 0.974 to 0.992, joints 1.5 to 2.3 %, rotations 3.2 to 4.3° (three choices of the points): how round parts
     # turn about their axes shows little without colours.
     "soft trunk, scans": Case(partial(doll, limb_bones=0), 40.0, scans_without_order, Gate(0.95, 4.0, 8.0), 20),
+    # The folds of soft elbows and knees are no bodies: without asking what they explain there are 12 or 13 of 11.
+    "soft limbs, tracks": Case(partial(doll, limb_bones=2), 16.0, perfect_tracks, Gate(0.97, 1.0, 0.5)),
+    # A soft trunk of two bodies between others is no third one in small images.
+    "soft trunk, images": Case(partial(doll, limb_bones=0), 40.0, small_images, Gate(0.95, 1.0, 1.0), 20),
     # Index 0.942 and 0.949, joints 1.7 and 2.3 % (along the hinges' axes), rotations 0.15 and 0.2° (two captures).
     "hinges, images": Case(fan, 30.0, small_images, Gate(0.9, 4.0, 1.0, near=10)),
 }
@@ -128,20 +132,3 @@ def test_one_body_too_few_is_noticed(ran, geomocap, tmp_path):
     assert any(name.startswith("bodies.found") for name in wrong)
     assert any(name.startswith("skeleton.true_edges") for name in wrong)
     assert any(name.startswith("joints.recall") for name in wrong)
-
-
-WRONG = {
-    # The folds of soft elbows and knees become bodies: 12 or 13 of 11, core index 0.99 (three choices of the points)
-    "soft limbs, tracks": Case(partial(doll, limb_bones=2), 16.0, perfect_tracks, Gate(0.97, 1.0, 0.5)),
-    # 4 of 3 bodies; all else is right: core index 0.97, joints 0.4 %, rotations 0.2°
-    "soft trunk, images": Case(partial(doll, limb_bones=0), 40.0, small_images, Gate(0.95, 1.0, 1.0), 20),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="more bodies than there are")
-@pytest.mark.parametrize("name", WRONG)
-def test_bodies_that_are_found_wrong_today(name, geomocap, tmp_path):
-    case = WRONG[name]
-    folder = run(case, tmp_path, geomocap)
-    assert case.gate.broken(figures(folder, tmp_path / "truth", geomocap)) == []
