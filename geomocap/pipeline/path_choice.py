@@ -62,6 +62,9 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> tuple[Motion
         return patches, "patches"
     reach = 0.0
     if patches is not None:
+        if patches.ray is not None:
+            # single cameras follow the rest of the surface: what is still uncovered is bulk of a hull of few cameras
+            return patches, "patches"
         reach = piece_reach(geometry.points(0))
         if uncovered_fraction(geometry.points, patches.positions, reach) < SMALLEST_PIECE:
             return patches, "patches"

@@ -39,14 +39,15 @@ class Ball:
 
 @pytest.fixture
 def job(tmp_path):
-    def make(paths: str, tracks: np.ndarray | None = None) -> Job:
+    def make(paths: str, tracks: np.ndarray | None = None, ray: np.ndarray | None = None) -> Job:
         config = Config(
             segmentation=SegmentationSettings(paths=paths),
             nodes=NodeTrackingSettings(nodes=60, coarse_nodes=40, points=600, coarse_points=400, colors=False),
         )
         run = Run(tmp_path / "run")
         if tracks is not None:
-            run.write_npz("tracks.npz", positions=tracks, sigma=np.full(tracks.shape[:2], 0.002))
+            rays = {} if ray is None else {"ray": ray}
+            run.write_npz("tracks.npz", positions=tracks, sigma=np.full(tracks.shape[:2], 0.002), **rays)
         return Job(run, config, executor)
 
     with ThreadPoolExecutor(1) as executor:
@@ -84,6 +85,13 @@ def test_nodes_on_the_piece_that_patches_leave_uncovered(job):
     assert (np.nanmax(nodes[:, :, 2], axis=1) < 0.0).all()
     # the nodes' precision is their own: nothing holds them along the surface
     assert np.nanmedian(paths.sigma[300:]) > 5 * np.nanmedian(paths.sigma[:300])
+
+
+def test_what_single_cameras_leave_uncovered_is_bulk_of_the_hull_and_gets_no_nodes(job):
+    tracks = trajectories(300, 1.0, 0.0)
+    ray = np.zeros_like(tracks)
+    ray[::2, :, 1] = 1.0
+    assert motion_paths(job("auto", tracks, ray), Ball(), True)[1] == "patches"
 
 
 def test_nodes_where_patches_are_there_for_a_while_only(job):
