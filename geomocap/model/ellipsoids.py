@@ -260,7 +260,8 @@ def union_errors(
     errors = np.zeros(count)
     for k in range(union.shape[0]):
         u = union[k]
-        errors[u] += error_terms(points, begin[k], end[k], moments[u], variances[u], axes[u])
+        if end[k] > begin[k]:
+            errors[u] += error_terms(points, begin[k], end[k], moments[u], variances[u], axes[u])
     for u in range(count):
         if moments[u, 0] > 0.0:
             errors[u] = equivalent_length(errors[u] / moments[u, 0])

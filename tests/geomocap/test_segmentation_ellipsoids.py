@@ -120,3 +120,9 @@ def test_contacts_do_not_wrap_around_the_grid():
 def test_bad_points_name_their_frame(points, text):
     with pytest.raises(GeometryError, match=text):
         check_points(points, 7, 16)
+
+
+def test_a_set_without_points_has_no_error_and_spoils_no_other():
+    points = np.random.default_rng(2).normal(size=(60, 3))
+    found = fit_ellipsoids(points, np.repeat([0, 2], 30), 3, 0.1)
+    assert found.counts.tolist() == [30, 0, 30] and found.errors[1] == 0 and (found.errors[[0, 2]] > 0).all()
