@@ -67,7 +67,8 @@ def working_volume(
         if frames_without == looked_at > settings.hull.tolerance:
             raise GeometryError(
                 f"camera {name}: its silhouettes are empty, or nearly so, in all {looked_at} frames looked at; check "
-                "its images and background, or its masks, or name only the other cameras in capture.toml"
+                "its images and background, or its masks, and its pose (what no other camera confirms is left out), or "
+                "name only the other cameras in capture.toml"
             )
     # A frame in which cameras see little leaves room for more than the subject
     longest = min(max(lengths), MOST_STRETCHED * float(np.median(lengths)))

@@ -92,7 +92,8 @@ def test_camera_looking_away(capture, geomocap, tmp_path):
     shutil.rmtree(capture / "sparse")
     write_rig(capture / "sparse", Rig(rig.names, rig.cameras, poses))
     said = refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
-    assert f"camera {rig.names[1]} contradict the others" in said
+    # nobody confirms what it sees, so nothing is left of it; where the others still agree with it they say so
+    assert f"camera {rig.names[1]}" in said and "its pose" in said
 
 
 def test_subject_outside_the_volume(capture, geomocap, tmp_path):

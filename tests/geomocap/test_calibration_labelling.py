@@ -11,10 +11,11 @@ from geomocap.calibration.calibration_settings import BarSettings
 from geomocap.calibration.disc import blurred_disc, fit_disc
 from geomocap.calibration.eccentricity import shifts
 from geomocap.calibration.labelling import identify_frame
-from geomocap.calibration.orientation import ideal_coordinates, relative_orientation, triangulate
+from geomocap.calibration.orientation import ideal_coordinates, relative_orientation
 from geomocap.calibration.pairs import eight_point, score_pairings
 from geomocap.calibration.projection import interior_of
 from geomocap.calibration.stability import resect
+from geomocap.model.triangulation import nearest_to_rays
 from tests.geomocap.bar_scenes import eight_cameras, seen, three_cameras, true_network
 
 SCENE = three_cameras(9, 24)
@@ -54,7 +55,8 @@ def test_eight_points_and_relative_orientation() -> None:
 def test_triangulation_needs_two_rays() -> None:
     origins = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 0]])
     directions = np.array([[0.6, 0, 0.8], [-0.28, 0, 0.96], [0, 0, 1.0]])
-    points = triangulate(origins, directions, np.array([0, 0, 1]), 3)
+    use = np.array([[True, False], [True, False], [False, True]])  # two rays of the first point, one of the second
+    points = nearest_to_rays(origins[:, None], np.repeat(directions[:, None], 2, axis=1), use)
     s = np.linalg.lstsq(np.stack([directions[0], -directions[1]], axis=1), origins[1] - origins[0], rcond=None)[0]
     np.testing.assert_allclose(points[0], s[0] * directions[0], atol=1e-12)
     assert np.isnan(points[1:]).all()
@@ -75,7 +77,7 @@ def labels_by_brute_force(pixels: np.ndarray, limit: float) -> np.ndarray:
             continue
         rays = np.array([np.r_[ideal[c, choice[c]], 1] @ R[c] for c in used])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        X = triangulate(SCENE.rig.centers[used], rays, np.zeros(len(used), dtype=np.int64), 1)
+        X = nearest_to_rays(SCENE.rig.centers[used][:, None], rays[:, None])
         image = SCENE.rig.project(X)[:, 0]
         if all(np.linalg.norm(image[c] - pixels[c, choice[c]]) < limit for c in used):
             ends.append((len(used), choice, X[0]))

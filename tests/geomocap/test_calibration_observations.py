@@ -11,10 +11,10 @@ import pytest
 from data_tools.calibration_files import read_calibration
 from geomocap.calibration.bar_calibration import calibrate_bar
 from geomocap.calibration.observed_points import Observed, observations_of, read_observed
-from geomocap.calibration.orientation import triangulate
 from geomocap.calibration.world import WorldKnowledge
 from geomocap.errors import CalibrationError
 from geomocap.model.rig import Rig
+from geomocap.model.triangulation import nearest_to_rays
 from tests.geomocap.bar_scenes import three_cameras
 
 SIZES = dict.fromkeys("abc", (640, 480))
@@ -75,7 +75,7 @@ def corners(observed: Observed, rig: Rig) -> dict[tuple[int, str], np.ndarray]:
         if len(own) >= 2:
             rays = [rig.rays(rig.names.index(observed.cameras[k]), observed.pixels[k][None]) for k in own]
             origins, directions = np.array([r[0] for r in rays]), np.array([r[1][0] for r in rays])
-            out[key] = triangulate(origins, directions, np.zeros(len(own), dtype=np.int64), 1)[0]
+            out[key] = nearest_to_rays(origins[:, None], directions[:, None])[0]
     return out
 
 
