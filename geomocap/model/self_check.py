@@ -9,7 +9,8 @@ import numpy as np
 
 Verdict = Literal["trust it", "check it", "don't use it"]
 
-GOOD, POOR = 0.8, 0.6  # model against silhouettes, mean intersection over union
+# Model against silhouettes, mean: 0.93 of a right result, 0.72 of limbs merged, 0.65 of silhouettes full of holes
+GOOD, POOR = 0.8, 0.6
 CONTRADICTS = 0.15  # by which a camera's left-out overlap is below the median camera's: it contradicts the others
 
 

@@ -12,8 +12,8 @@ from geomocap.settings import Settings
 class TrackingSettings(Settings):
     """How patches of the surface are placed and followed.
 
-    Templates of a camera's first view slide least, but are lost sooner. A walking man, eight cameras 640×480, 2,000
-    patches: drift median / 95 %, and length as a fraction of the frames in which two cameras see the point:
+    Templates of a camera's first view slide least, but are lost sooner. Version 0.1.0, a walking man, eight cameras
+    640×480, 2,000 patches: drift median / 95 %, and length as a fraction of the frames in which two cameras see it:
 
         ========  =====================  ======  =====================  ======
         template  20 frames: drift (mm)  length  60 frames: drift (mm)  length
