@@ -70,7 +70,7 @@ def write_c3d(path: Path, markers: Markers, motion: MotionTree | None = None) ->
 
 
 def _is_whole(path: Path, markers: Markers, motion: MotionTree | None) -> bool:
-    """Whether a C3D holds its points and, from the next block on, its rotations; ezc3d doesn't say if a disk is full."""
+    """Whether a C3D holds its points and, from the next block on, its rotations; ezc3d tells of no full disk."""
     data = path.read_bytes()
     first = int.from_bytes(data[16:18], "little") - 1  # blocks before the points
     points = 4 * 4 * len(markers.names) * markers.n_frames  # bytes

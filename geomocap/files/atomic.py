@@ -190,8 +190,8 @@ def _reason(error: BaseException, temporary: Path) -> OSError | None:
 
     Libraries swallow the reason, or say it in words of their own: the disk is asked once more.
     """
-    if isinstance(error, OSError) and error.errno is not None and error.strerror:
-        return error
+    if isinstance(error, OSError) and error.errno in errno.errorcode:
+        return OSError(error.errno, os.strerror(error.errno))
     if isinstance(error, GeomocapError) or not isinstance(error, Exception):
         return None
     try:

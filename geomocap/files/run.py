@@ -23,7 +23,7 @@ import numpy as np
 import tomli_w
 
 from geomocap.errors import RunError
-from geomocap.files.atomic import write_text
+from geomocap.files.atomic import links, write_text
 from geomocap.files.npz import read_npz, write_npz
 from geomocap.files.stage_records import (
     FOLDER,
@@ -136,6 +136,8 @@ class Run:
         dict of str to str
             Files that the stage wrote before and that are no longer as it wrote them, with what is wrong with each.
         """
+        for link in (link for name in (*outputs, *optional) for link in links(self.path / name, 2)):
+            raise RunError(f"{link}: is a link, a run writes into its own folder; remove it or choose another folder")
         record = read_record(self.path, stage)
         if record.key == key:
             faults = record.faults(self.path)
