@@ -1,4 +1,4 @@
-"""The door for writing: whole or not at all, whatever library writes, when there is no room or the process is killed."""
+"""The door for writing: whole or not at all, whatever library writes; no room, killed processes."""
 
 from __future__ import annotations
 
