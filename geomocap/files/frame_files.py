@@ -9,7 +9,7 @@ import open3d as o3d
 
 from geomocap.errors import GeometryError
 from geomocap.files.atomic import write_atomic
-from geomocap.files.open3d_geometry import read_by_open3d
+from geomocap.files.open3d_geometry import read_by_open3d, write_by_open3d
 from geomocap.files.whole_files import is_whole_ply
 from geomocap.model.frame_geometry import BodyPoints, Voxels
 
@@ -17,7 +17,7 @@ from geomocap.model.frame_geometry import BodyPoints, Voxels
 def write_voxels(path: Path, voxels: Voxels) -> None:
     """Write voxels as the PLY of an Open3D voxel grid, whole or not at all."""
     grid = voxels.to_open3d()
-    write_atomic(path, lambda p: o3d.io.write_voxel_grid(p, grid), is_whole_ply, lasting=False)
+    write_atomic(path, write_by_open3d(o3d.io.write_voxel_grid, grid), is_whole_ply, lasting=False)
 
 
 def read_voxels(path: Path) -> Voxels:
@@ -42,7 +42,7 @@ def read_voxels(path: Path) -> Voxels:
 def write_points(path: Path, points: BodyPoints | o3d.t.geometry.PointCloud) -> None:
     """Write points with their bodies, or any tensor point cloud, as PLY, whole or not at all."""
     cloud = points.to_open3d() if isinstance(points, BodyPoints) else points
-    write_atomic(path, lambda p: o3d.t.io.write_point_cloud(p, cloud), is_whole_ply, lasting=False)
+    write_atomic(path, write_by_open3d(o3d.t.io.write_point_cloud, cloud), is_whole_ply, lasting=False)
 
 
 def read_points(path: Path) -> BodyPoints:

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import open3d as o3d
@@ -40,6 +40,16 @@ def read_by_open3d(read: Callable[[Path], T], path: Path) -> T:
         check_ply(path)
     with _alone, o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         return read(path)
+
+
+def write_by_open3d(write: Callable[[Path, Any], bool], geometry: Any) -> Callable[[Path], bool]:
+    """Return what writes a geometry by one of Open3D's functions, which is silent then."""
+
+    def silently(path: Path) -> bool:
+        with _alone, o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            return write(path, geometry)
+
+    return silently
 
 
 @dataclass

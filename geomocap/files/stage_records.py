@@ -79,7 +79,8 @@ class StageRecord:
         """Say what is wrong with which file; nothing of those that are as they were written."""
         found = {name: mark.fault(run / name) for name, mark in self.files.items()}
         if self.done:
-            found |= {name: "missing" for name in self.outputs if not (run / name).exists()}
+            told = {part.as_posix() for name, fault in found.items() if fault for part in Path(name).parents}
+            found |= {n: "missing" for n in self.outputs if n not in told and not (run / n).exists()}
         return {name: fault for name, fault in found.items() if fault}
 
     def sound(self, run: Path) -> StageRecord:
@@ -89,10 +90,11 @@ class StageRecord:
 
 
 def listed_faults(faults: Mapping[str, str], most: int = 3) -> str:
-    """Say in words which files are not as they were written, `most` of them by name."""
-    named = [f"{name} is {fault}" for name, fault in list(faults.items())[:most]]
-    more = len(faults) - len(named)
-    return ", ".join(named) + (f" and {more} more files aren't as they were written" if more else "")
+    """Say in words which files are not as they were written: up to `most` by name, of more the first one."""
+    said = [f"{name} is {fault}" for name, fault in faults.items()]
+    if len(said) <= most:
+        return ", ".join(said)
+    return f"{said[0]}, and {len(said) - 1} other files are not as they were written"
 
 
 def stages(run: Path) -> list[str]:

@@ -61,7 +61,7 @@ def test_a_file_that_is_not_as_it_was_written_is_noticed(run):
     assert run.sound("voxels") == {run.frame_file("voxels", k) for k in (3, 4)}
     assert run.unfinished() == ["voxels"]
     said = listed_faults(faults, 1)
-    assert said == "voxels/000000.ply is missing and 2 more files aren't as they were written"
+    assert said == "voxels/000000.ply is missing, and 2 other files are not as they were written"
 
 
 def test_optional_files_count_too(run):
