@@ -23,6 +23,7 @@ from geomocap.errors import GeomocapError, RunError
 
 Check = Callable[[Path], bool]
 
+_UNABLE = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)  # of file systems that can't do what is asked
 _NOT_WHOLE = "it could not be written whole"
 _PROBE = 1 << 20  # bytes: more than any library holds back
 _TEMPORARY = re.compile(r"\.geomocap-([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.tmp(\..*)?")
@@ -182,6 +183,24 @@ def _machine() -> str:
     return f"{zlib.crc32(platform.node().encode('utf-8', 'replace')):08x}"
 
 
+def make_room(path: Path, size: int) -> None:
+    """Make sure that a file of so many bytes has room, where the file system can tell.
+
+    Raises
+    ------
+    OSError
+        If there is none.
+    """
+    if not hasattr(os, "posix_fallocate"):
+        return
+    with path.open("wb") as file:
+        try:
+            os.posix_fallocate(file.fileno(), 0, size)
+        except OSError as error:
+            if error.errno not in _UNABLE:
+                raise
+
+
 # --- what went wrong ---
 
 
@@ -190,7 +209,7 @@ def _reason(error: BaseException, temporary: Path) -> OSError | None:
 
     Libraries swallow the reason, or say it in words of their own: the disk is asked once more.
     """
-    if isinstance(error, OSError) and error.errno in errno.errorcode:
+    if isinstance(error, OSError) and error.errno is not None and error.errno in errno.errorcode:
         return OSError(error.errno, os.strerror(error.errno))
     if isinstance(error, GeomocapError) or not isinstance(error, Exception):
         return None
@@ -225,7 +244,7 @@ def _to_disk(path: Path) -> None:
         try:
             os.fsync(file.fileno())
         except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS):  # of file systems that can't
+            if error.errno not in _UNABLE:
                 raise
 
 

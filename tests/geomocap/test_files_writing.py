@@ -98,12 +98,25 @@ def no_file_beyond(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+@contextmanager
+def small_disk(place: Path, kilobytes: int) -> Iterator[Path]:
+    """Mount a disk of some kB."""
+    place.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(place)]
+    if not shutil.which("mount") or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("no right to mount a small disk")
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", "-l", str(place)], check=True)
+
+
 def content(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_no_room_leaves_what_was_there_and_says_why(tmp_path, name):
+def test_no_room_leaves_what_was_there_and_says_why(tmp_path, name, capfd):
     pytest.importorskip(NEEDS.get(name.split(".")[-1], "numpy"))
     write, place = WRITERS[name], tmp_path / "place"
     write(place / name)
@@ -119,15 +132,11 @@ def test_no_room_leaves_what_was_there_and_says_why(tmp_path, name):
         assert not list((tmp_path / "empty").rglob("*")), room
     write(tmp_path / "empty" / name)
     assert content(tmp_path / "empty") == whole
+    assert capfd.readouterr() == ("", ""), "what libraries say of it stays with them"
 
 
 def test_a_small_disk_says_that_it_is_full(tmp_path):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = ["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", str(disk)]
-    if not shutil.which("mount") or subprocess.run(mounted, capture_output=True).returncode:
-        pytest.skip("no right to mount a small disk")
-    try:
+    with small_disk(tmp_path / "disk", 16) as disk:
         for name in ("voxels.ply", "mask.png", "text_model", "text.txt"):
             for number in range(9):  # until it is full, whatever is left in the end
                 try:
@@ -138,8 +147,6 @@ def test_a_small_disk_says_that_it_is_full(tmp_path):
             else:
                 pytest.fail("it has room for everything")
             assert not list(disk.glob(".*"))
-    finally:
-        subprocess.run(["umount", "-l", str(disk)], check=True)
 
 
 def test_a_folder_is_swapped_as_a_whole_and_other_files_stay(tmp_path):
