@@ -172,6 +172,10 @@ class Run:
         if record.key:
             self._write_files(stage, record, [f for f in files if f.is_relative_to(self.path)])
 
+    def forget(self, stage: str) -> None:
+        """Know nothing of a stage any more; its files stay."""
+        forget_record(self.path, stage)
+
     def is_done(self, stage: str, key: str) -> bool:
         """Whether the stage is complete with this key and all its files are as it wrote them."""
         record = read_record(self.path, stage)

@@ -43,7 +43,8 @@ def working_in(
     RunError
         If somebody else works there, or the folder can't be written.
     """
-    folder, is_new = run.path / FOLDER, not os.path.lexists(run.path)
+    folder = run.path / FOLDER
+    new = [path for path in (folder, run.path) if not os.path.lexists(path)]
     try:
         Path(os.path.realpath(folder)).mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder / LOCK)
@@ -66,10 +67,10 @@ def working_in(
     finally:
         with suppress(OSError):
             (folder / WHO).unlink(missing_ok=True)
-            if is_new and [p.name for p in folder.iterdir()] == [LOCK] and list(run.path.iterdir()) == [folder]:
+            if new and [p.name for p in folder.iterdir()] == [LOCK]:  # nothing was written
                 (folder / LOCK).unlink()
-                folder.rmdir()
-                run.path.rmdir()
+                for path in new:
+                    path.rmdir()
         lock.release()
 
 
