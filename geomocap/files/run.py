@@ -44,6 +44,7 @@ _FRAMES = {  # folders of numbered frames, and what their files are called
     "cloud": "[0-9][0-9][0-9][0-9][0-9][0-9].*",
     "bodies": "[0-9][0-9][0-9][0-9][0-9][0-9].ply",
 }
+_RESULTS = ("*.npz", "motion.*", "check.json")  # as stages call them
 
 
 def stage_key(module: str, *parts: Any) -> str:
@@ -229,19 +230,23 @@ class Run:
 
     # --- records ---
 
-    def write_record(self, record: dict[str, Any]) -> None:
-        """Write `run.toml`: the configuration, the versions and the source.
+    def claim(self) -> None:
+        """Make sure that what stages will write over is the run's own.
 
         Raises
         ------
         RunError
-            If the folder is no run yet and holds results already, which then are somebody else's; or it can't be
-            written.
+            If the folder is no run yet and holds results already, which then are somebody else's.
         """
-        if not self.has("run.toml") and not stages(self.path):
-            theirs = next((p for name, frame in _FRAMES.items() for p in (self.path / name).glob(frame)), None)
-            if theirs is not None:
-                raise RunError(f"{theirs}: is there, but not of a run in this folder; move it or choose another folder")
+        if self.has("run.toml") or stages(self.path):
+            return
+        patterns = (*(f"{name}/{frame}" for name, frame in _FRAMES.items()), *_RESULTS)
+        theirs = next((p for pattern in patterns for p in self.path.glob(pattern)), None)
+        if theirs is not None:
+            raise RunError(f"{theirs}: is there, but not of a run in this folder; move it or choose another folder")
+
+    def write_record(self, record: dict[str, Any]) -> None:
+        """Write `run.toml`: the configuration, the versions and the source."""
         write_text(self.path / "run.toml", tomli_w.dumps(record))
 
     def read_record(self) -> dict[str, Any]:

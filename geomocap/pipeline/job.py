@@ -103,6 +103,7 @@ class Job:
             "fps": self.fps,
             "up": self.up,
         }
+        self.run.claim()
         before = self._recorded(source) if tables else {}
         model = before.get("source", {}).get("model") if self.model is None else str(self.model)
         kept = before.get("config", {})

@@ -103,11 +103,12 @@ def test_files_of_others_stay(run):
     assert "review" not in [f.stem for f in (run.path / ".stages").glob("*.json")], "nothing is left to be missed"
 
 
-def test_results_in_a_folder_that_is_no_run_are_not_ours(tmp_path):
-    write_text(tmp_path / "voxels" / "000000.ply", "somebody's")
-    with pytest.raises(RunError, match=r"voxels/000000\.ply: is there, but not of a run"):
-        Run(tmp_path).write_record({})
-    assert (tmp_path / "voxels" / "000000.ply").read_text() == "somebody's"
+@pytest.mark.parametrize("name", ["voxels/000000.ply", "silhouettes/left/000007.png", "motion.bvh", "model.npz"])
+def test_results_in_a_folder_that_is_no_run_are_not_ours(tmp_path, name):
+    write_text(tmp_path / name, "somebody's")
+    with pytest.raises(RunError, match=f"{name}: is there, but not of a run"):
+        Run(tmp_path).claim()
+    assert (tmp_path / name).read_text() == "somebody's"
 
 
 @pytest.mark.parametrize(
