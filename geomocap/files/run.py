@@ -38,13 +38,17 @@ from geomocap.files.stage_records import (
 from geomocap.source_digest import module_digest
 from geomocap.version import __version__
 
-_FRAMES = {  # folders of numbered frames, and what their files are called
+_OWN = {  # folders of stages, and what is theirs there though no record says so
     "silhouettes": "*/[0-9][0-9][0-9][0-9][0-9][0-9].png",
     "voxels": "[0-9][0-9][0-9][0-9][0-9][0-9].ply",
     "cloud": "[0-9][0-9][0-9][0-9][0-9][0-9].*",
     "bodies": "[0-9][0-9][0-9][0-9][0-9][0-9].ply",
+    "review": "report.html",
 }
-_RESULTS = ("*.npz", "motion.*", "check.json")  # as stages call them
+_RESULTS = (  # as stages call them
+    *(f"{name}.npz" for name in ("diagnostics", "ellipsoids", "keypoints", "model", "skeleton", "tracks")),
+    *("motion.*", "check.json"),
+)
 
 
 def stage_key(module: str, *parts: Any) -> str:
@@ -168,10 +172,11 @@ class Run:
         self._write_files(stage, replace(record, done=True), files)
 
     def renew(self, stage: str, files: Iterable[Path]) -> None:
-        """Take files of the run as those of a stage from now on: it was told to write them in another way."""
+        """Take files of the run as those of a stage from now on: a command has written them."""
         record = read_record(self.path, stage)
-        if record.key:
-            self._write_files(stage, record, [f for f in files if f.is_relative_to(self.path)])
+        if not record.key:  # the stage itself will make them anew
+            record = StageRecord("made by a command", True)
+        self._write_files(stage, record, [f for f in files if f.is_relative_to(self.path)])
 
     def forget(self, stage: str) -> None:
         """Know nothing of a stage any more; its files stay."""
@@ -195,7 +200,7 @@ class Run:
 
     def folders(self) -> list[Path]:
         """Folders of the run that stages write into and that are there."""
-        found = [self.path, *(self.path / name for name in (FOLDER, *_FRAMES, "review"))]
+        found = [self.path, *(self.path / name for name in (FOLDER, *_OWN))]
         found += [p for p in (self.path / "silhouettes").glob("*") if p.is_dir()]
         return [p for p in found if p.is_dir() and not p.is_symlink()]
 
@@ -210,12 +215,12 @@ class Run:
         gone = set(records[stage].files) if stage in records else set()
         for name in (*own, *derived):
             gone |= {n for n in written if n.startswith(f"{name}/")}
-            pattern = _FRAMES.get(name)
+            pattern = _OWN.get(name)
             if pattern is not None:
                 gone |= {p.relative_to(self.path).as_posix() for p in (self.path / name).glob(pattern)}
             elif (self.path / name).is_file():
                 gone.add(name)
-        folders = set()
+        folders = {self.path / name for name in (*own, *derived) if name in _OWN}
         for name in gone:
             file = self.path / name
             if file.parent.resolve().is_relative_to(self.path.resolve()):  # not through a link
@@ -240,7 +245,7 @@ class Run:
         """
         if self.has("run.toml") or stages(self.path):
             return
-        patterns = (*(f"{name}/{frame}" for name, frame in _FRAMES.items()), *_RESULTS)
+        patterns = (*(f"{name}/{own}" for name, own in _OWN.items()), *_RESULTS)
         theirs = next((p for pattern in patterns for p in self.path.glob(pattern)), None)
         if theirs is not None:
             raise RunError(f"{theirs}: is there, but not of a run in this folder; move it or choose another folder")
