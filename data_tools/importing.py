@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -23,6 +22,8 @@ from geomocap.files.rigs import read_rig, write_rig
 from geomocap.files.videos import VIDEO_ENDINGS, Video
 from geomocap.model.rig import Rig
 from geomocap.progress import Progress, silent
+from geomocap.reading import read_toml
+from geomocap.settings import LEAST_FPS, MOST_FPS
 
 PLATE_FRAMES = 25  # frames of a video that a plate is composed from
 
@@ -229,11 +230,15 @@ def _frame_rate(source: Path, files: list[Path]) -> float:
     """Frames per second: as Config.toml says, else as all videos agree."""
     config = source / "Config.toml"
     if config.is_file():
-        try:
-            rate = tomllib.loads(config.read_text(encoding="utf-8")).get("project", {}).get("frame_rate")
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise CaptureError(f"{config}: not valid TOML ({error})") from None
-        if isinstance(rate, int | float) and rate > 0:
+        project = read_toml(config, CaptureError).get("project", {})
+        if not isinstance(project, dict):
+            raise CaptureError(f"{config}: project is no table; write [project] as Pose2Sim does")
+        rate = project.get("frame_rate")
+        if isinstance(rate, int | float) and not isinstance(rate, bool):
+            if not LEAST_FPS <= rate <= MOST_FPS:
+                raise CaptureError(
+                    f"{config}: frame_rate is {rate}; expected {LEAST_FPS:g} to {MOST_FPS:,.0f} per second"
+                )
             return float(rate)
     rates = {file.name: frame_rate(file) for file in files}
     if max(rates.values()) - min(rates.values()) > 0.01 * max(rates.values()):

@@ -8,13 +8,14 @@ from collections import Counter
 
 from tests.arrows import PACKAGES, ROOT, arrows, circle, sources
 
-BASE = {"errors", "progress", "settings", "scheduling"}
+BASE = {"errors", "progress", "reading", "settings", "scheduling"}
 VALUES = BASE | {"model"}
 ROOMS: dict[str, set[str]] = {
     # without anything of the subject
     "errors": set(),
     "progress": set(),
-    "settings": {"errors"},
+    "reading": {"errors"},
+    "settings": {"errors", "reading"},
     "scheduling": {"progress"},
     "version": set(),
     "source_digest": set(),

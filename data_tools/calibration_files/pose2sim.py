@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 
 import numpy as np
 import tomli_w
 from scipy.spatial.transform import Rotation
 
-from data_tools.calibration_files.opencv_cameras import camera_from_opencv, camera_to_opencv, read_text
+from data_tools.calibration_files.opencv_cameras import camera_from_opencv, camera_to_opencv
 from geomocap.errors import CalibrationError
 from geomocap.files.atomic import write_text
 from geomocap.model.rig import Rig
+from geomocap.reading import read_toml
 
 
 def read_pose2sim(path: Path) -> Rig:
@@ -28,10 +28,7 @@ def read_pose2sim(path: Path) -> Rig:
         If the file is no TOML, holds no camera, or one lacks something.
     """
     path = Path(path)
-    try:
-        tables = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise CalibrationError(f"{path}: not valid TOML ({error})") from None
+    tables = read_toml(path, CalibrationError, "give a calibration file")
     names, cameras, poses = [], [], []
     for key, table in tables.items():
         if not isinstance(table, dict) or "matrix" not in table:

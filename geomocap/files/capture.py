@@ -12,7 +12,6 @@ bar/<camera>/000000.png          optional reference-bar recording
 from __future__ import annotations
 
 import os
-import tomllib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -28,7 +27,8 @@ from geomocap.files.images import IMAGE_ENDINGS, ImageFolder, read_image, size_t
 from geomocap.files.rigs import read_rig
 from geomocap.files.videos import VIDEO_ENDINGS, Video
 from geomocap.model.rig import Rig
-from geomocap.settings import Settings
+from geomocap.reading import read_toml
+from geomocap.settings import LEAST_FPS, MOST_FPS, Settings, explained
 
 PARTS = ("capture.toml", "images", "videos", "background", "masks", "sparse", "bar", "reference")
 
@@ -39,7 +39,7 @@ class CaptureInfo(Settings):
     """What `capture.toml` says."""
 
     name: str = Field("capture", description="name of the recording")
-    fps: float = Field(gt=0, description="frames per second")
+    fps: float = Field(ge=LEAST_FPS, le=MOST_FPS, description="frames per second")
     length_unit: Literal["m"] = Field("m", description="unit of the calibration")
     up: Literal["y", "z"] = Field("z", description="world axis that points up")
     cameras: tuple[str, ...] | None = Field(None, description="the cameras to use, in this order; all if not given")
@@ -304,18 +304,9 @@ def read_capture_info(path: Path) -> CaptureInfo:
     """Read and check `capture.toml` of a capture folder."""
     file = path / "capture.toml"
     try:
-        return CaptureInfo(**tomllib.loads(file.read_text(encoding="utf-8")))
-    except OSError as error:
-        raise CaptureError(
-            f"{file}: can't be read ({error.strerror}); a capture needs at least `fps = …` in it"
-        ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CaptureError(f"{file}: not valid TOML ({error})") from None
+        return CaptureInfo(**read_toml(file, CaptureError, "a capture needs at least `fps = …` in it"))
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(p) for p in first["loc"])
-        message = first["msg"].removeprefix("Value error, ")
-        raise CaptureError(f"{file}: {key}: {message}; see README, section Captures") from None
+        raise CaptureError(f"{file}: {explained(error)}; see README, section Captures") from None
 
 
 def write_capture_info(path: Path, info: CaptureInfo) -> None:

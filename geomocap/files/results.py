@@ -30,6 +30,7 @@ from geomocap.model.hierarchy import parents_first
 from geomocap.model.keypoint_paths import KeyPointPaths, KeyPoints
 from geomocap.model.skeleton import Skeleton, body_names, joint_names
 from geomocap.model.trajectories import Trajectories
+from geomocap.reading import read_json
 
 ELLIPSOIDS, SKELETON, KEYPOINTS = "ellipsoids.npz", "skeleton.npz", "keypoints.npz"
 DIAGNOSTICS, WARNINGS = "diagnostics.npz", "diagnostics.json"
@@ -250,12 +251,13 @@ def read_warnings(run: Run) -> list[str]:
         If the file is damaged.
     """
     file = run.path / WARNINGS
-    try:
-        return [str(w) for w in json.loads(file.read_text(encoding="utf-8")).get("warnings", [])]
-    except FileNotFoundError:
+    if not file.is_file():
         return []
-    except (OSError, ValueError, AttributeError) as error:
-        raise RunError(f"{file}: damaged ({error}); delete it and run again") from None
+    found = read_json(file, RunError)
+    warnings = found.get("warnings", []) if isinstance(found, dict) else None
+    if not isinstance(warnings, list):
+        raise RunError(f"{file}: damaged (no list of warnings); delete it and run again")
+    return [str(w) for w in warnings]
 
 
 # --- whatever was followed ---

@@ -11,8 +11,10 @@ import trimesh
 
 from geomocap.errors import GeometryError
 from geomocap.files.frame_files import read_voxels
+from geomocap.files.npz import array_names, read_arrays
 from geomocap.files.open3d_geometry import check_ply, read_by_open3d
 from geomocap.files.ragged_arrays import spread_over_frames
+from geomocap.reading import reason, shortened
 
 MESH_ENDINGS = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 CLOUD_ENDINGS = (".ply", ".pcd", ".xyz", ".pts")
@@ -117,9 +119,8 @@ def holds_tracks(path: Path) -> bool:
     if path.suffix.lower() != ".npz":
         return False
     try:
-        with np.load(path, allow_pickle=False) as data:
-            return set(data.files) >= _TRACKS
-    except (OSError, ValueError, EOFError):
+        return set(array_names(path)) >= _TRACKS
+    except (OSError, ValueError):
         return False  # what is wrong with it, reading it says
 
 
@@ -129,25 +130,19 @@ def read_array(path: Path) -> np.ndarray:
     Of tracks, whose first axis is that of the points, the axes are exchanged.
     """
     try:
-        data = np.load(path, allow_pickle=False)
-        if isinstance(data, np.ndarray):
-            array = data
-        else:
-            with data:
-                name = next((n for n in ("points", "positions", "vertices") if n in data.files), None)
-                if name is None:
-                    raise GeometryError(
-                        f"{path}: expected an array `points` of shape (N, 3) or (T, N, 3); "
-                        f"it has {', '.join(data.files)}"
-                    )
-                array = data[name]
-                if _TRACKS <= set(data.files):
-                    if str(data["layout"] if "layout" in data.files else "") == "ragged":
-                        array = spread_over_frames(array, data["first"], data["start"], int(data["n_frames"]))
-                    if array.ndim == 3:
-                        array = array.swapaxes(0, 1)
-    except (OSError, ValueError, KeyError, IndexError, EOFError) as error:
-        raise GeometryError(f"{path}: can't be read as plain arrays ({error})") from None
+        found = read_arrays(path)
+        name = next((n for n in ("", "points", "positions", "vertices") if n in found), None)
+        if name is None:
+            has = shortened(", ".join(found)) or "none"
+            raise GeometryError(f"{path}: expected an array `points` of shape (N, 3) or (T, N, 3); it has {has}")
+        array = found[name]
+        if found.keys() >= _TRACKS:
+            if str(found.get("layout", "")) == "ragged":
+                array = spread_over_frames(array, found["first"], found["start"], int(found["n_frames"]))
+            if array.ndim == 3:
+                array = array.swapaxes(0, 1)
+    except (OSError, ValueError, KeyError, IndexError, TypeError, OverflowError, MemoryError) as error:
+        raise GeometryError(f"{path}: can't be read as plain arrays ({reason(error)})") from None
     if array.ndim not in (2, 3) or array.shape[-1] != 3 or array.dtype.kind not in "fiu":
         raise GeometryError(
             f"{path}: expected numbers of shape (N, 3) or (T, N, 3), got {array.dtype} of shape {array.shape}"
