@@ -17,12 +17,12 @@ from data_tools.synthesize import write_png
 from geomocap.errors import CalibrationError, CaptureError, GeomocapError
 from geomocap.files.atomic import write_atomic
 from geomocap.files.capture import Capture, CaptureInfo, write_capture_info
-from geomocap.files.images import IMAGE_ENDINGS, read_image
+from geomocap.files.images import IMAGE_ENDINGS, check_image, read_image
 from geomocap.files.rigs import read_rig, write_rig
 from geomocap.files.videos import VIDEO_ENDINGS, Video
 from geomocap.model.rig import Rig
 from geomocap.progress import Progress, silent
-from geomocap.reading import read_toml
+from geomocap.reading import list_folder, read_toml
 from geomocap.settings import LEAST_FPS, MOST_FPS
 
 PLATE_FRAMES = 25  # frames of a video that a plate is composed from
@@ -108,7 +108,8 @@ def import_pose2sim(
         target = capture / "videos" / f"{name}{file.suffix.lower()}"
         write_atomic(target, lambda p, file=file: shutil.copyfile(file, p))  # type: ignore[misc]
     progress("videos", len(files), len(files))
-    rig = Rig(rig.names, tuple(cameras), np.array(rig.cam_from_world))
+    rig = Rig(rig.names, tuple(cameras), np.array(rig.cam_from_world), rig.notes)
+    notes += rig.notes
     write_rig(capture / "sparse", rig)
     fps = _frame_rate(source, files)
     write_capture_info(capture, CaptureInfo(name=source.resolve().name, fps=fps, up="z", cameras=rig.names))
@@ -157,13 +158,14 @@ def import_colmap(
     rig = read_rig(model)
     pose = np.array(rig.cam_from_world)
     pose[:, :, 3] *= metres_per_unit
-    rig = Rig(rig.names, rig.cameras, pose)
-    for k, name in enumerate(rig.names):
+    rig = Rig.of_file(str(model), rig.names, rig.cameras, pose, rig.notes)
+    frames = {name: _checked_images(source / "images" / name) for name in rig.names}
+    counts = {name: len(files) for name, files in frames.items()}
+    if len(set(counts.values())) > 1:
+        listed = ", ".join(f"{n}: {c}" for n, c in counts.items())
+        raise CaptureError(f"{source}: cameras have unequal numbers of frames ({listed}); cut them to the same frames")
+    for k, (name, files) in enumerate(frames.items()):
         progress("images", k, len(rig))
-        folder = source / "images" / name
-        files = sorted(f for f in folder.glob("*") if f.is_file() and not f.name.startswith("."))
-        if not files:
-            raise CaptureError(f"{folder}: holds no images; COLMAP's images must lie in images/<camera>/<frame>.*")
         for t, file in enumerate(files):
             target = capture / "images" / name / f"{t:06d}{file.suffix.lower()}"
             if file.suffix.lower() in IMAGE_ENDINGS:
@@ -175,7 +177,18 @@ def import_colmap(
     write_capture_info(capture, CaptureInfo(name=source.resolve().name, fps=fps, up=up, cameras=rig.names))
     opened = Capture.open(capture)
     notes = () if metres_per_unit != 1.0 else ("the model's unit is taken as a metre; give metres_per_unit if not",)
-    return ImportReport(opened, opened.rig, notes)
+    return ImportReport(opened, opened.rig, (*rig.notes, *notes))
+
+
+def _checked_images(folder: Path) -> list[Path]:
+    """List the images of a camera, all of which are whole."""
+    entries = list_folder(folder, CaptureError) if folder.is_dir() else []
+    files = [f for f in entries if f.is_file() and not f.name.startswith(".")]
+    if not files:
+        raise CaptureError(f"{folder}: holds no images; COLMAP's images must lie in images/<camera>/<frame>.*")
+    for file in files:
+        check_image(file)
+    return files
 
 
 def _must_be_free(capture: Path) -> None:

@@ -50,6 +50,14 @@ def read_bytes(path: Path, most: int | None = None) -> bytes:
         return file.read()
 
 
+def list_folder(folder: Path, error: type[GeomocapError]) -> list[Path]:
+    """List what is in a folder, sorted; raises `error` if it can't be read."""
+    try:
+        return sorted(folder.iterdir())
+    except OSError as failed:
+        raise error(f"{folder}: can't be read ({failed.strerror or failed}); make it readable") from None
+
+
 def read_text(path: Path, error: type[GeomocapError], hint: str = "", most: int = MOST_TEXT) -> str:
     """Read a UTF-8 text, with or without byte order mark.
 

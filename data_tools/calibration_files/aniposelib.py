@@ -18,7 +18,7 @@ from data_tools.calibration_files.plausibility import check_rig, check_size, in_
 from geomocap.errors import CalibrationError
 from geomocap.files.atomic import write_text
 from geomocap.model.rig import Rig
-from geomocap.reading import read_toml
+from geomocap.reading import read_toml, reason
 
 
 def read_aniposelib(path: Path, metres_per_unit: float = 1.0) -> Rig:
@@ -60,8 +60,8 @@ def read_aniposelib(path: Path, metres_per_unit: float = 1.0) -> Rig:
             distortions = [float(v) for v in np.ravel(table.get("distortions", []))]
             turn = np.array(table["rotation"], dtype=float)
             t = np.array(table["translation"], dtype=float).reshape(3)
-        except (TypeError, ValueError) as error:
-            raise CalibrationError(f"{where}: numbers missing or misplaced ({error})") from None
+        except (TypeError, ValueError, OverflowError) as error:
+            raise CalibrationError(f"{where}: numbers missing or misplaced ({reason(error)})") from None
         if turn.size == 3:
             R = Rotation.from_rotvec(turn.reshape(3)).as_matrix()
         else:
@@ -76,7 +76,7 @@ def read_aniposelib(path: Path, metres_per_unit: float = 1.0) -> Rig:
         poses.append(np.column_stack([R, in_metres(t, metres_per_unit, str(path))]))
     if not names:
         raise CalibrationError(f"{path}: holds no camera (a table with `matrix`); is it an aniposelib calibration?")
-    rig = Rig(tuple(names), tuple(cameras), np.array(poses))
+    rig = Rig.of_file(str(path), names, cameras, np.array(poses))
     check_rig(rig, str(path))
     return rig
 

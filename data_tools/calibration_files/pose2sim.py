@@ -12,7 +12,7 @@ from data_tools.calibration_files.opencv_cameras import camera_from_opencv, came
 from geomocap.errors import CalibrationError
 from geomocap.files.atomic import write_text
 from geomocap.model.rig import Rig
-from geomocap.reading import read_toml
+from geomocap.reading import read_toml, reason
 
 
 def read_pose2sim(path: Path) -> Rig:
@@ -43,15 +43,15 @@ def read_pose2sim(path: Path) -> Rig:
             distortions = [float(v) for v in table.get("distortions", [])]
             R = Rotation.from_rotvec(np.array(table["rotation"], dtype=float).reshape(3)).as_matrix()
             t = np.array(table["translation"], dtype=float).reshape(3)
-        except (TypeError, ValueError) as error:
-            raise CalibrationError(f"{where}: numbers missing or misplaced ({error})") from None
+        except (TypeError, ValueError, OverflowError) as error:
+            raise CalibrationError(f"{where}: numbers missing or misplaced ({reason(error)})") from None
         fisheye = bool(table.get("fisheye", False))
         cameras.append(camera_from_opencv(matrix, distortions, width, height, fisheye=fisheye, where=where))
         names.append(str(table.get("name", key)))
         poses.append(np.column_stack([R, t]))
     if not names:
         raise CalibrationError(f"{path}: holds no camera (a table with `matrix`); is it a Pose2Sim calibration?")
-    return Rig(tuple(names), tuple(cameras), np.array(poses))
+    return Rig.of_file(str(path), names, cameras, np.array(poses))
 
 
 def write_pose2sim(rig: Rig, path: Path) -> None:

@@ -18,7 +18,7 @@ from geomocap.files.capture import FrameSource
 from geomocap.files.images import IMAGE_ENDINGS, ImageFolder
 from geomocap.files.videos import VIDEO_ENDINGS, Video
 from geomocap.progress import Progress, silent
-from geomocap.reading import read_toml
+from geomocap.reading import check_name, list_folder, read_toml
 from geomocap.scheduling import map_items, threads
 from geomocap.settings import Settings, explained
 
@@ -75,16 +75,19 @@ class Recording:
         info = read_bar_info(folder / "bar.toml", length)
         sources: dict[str, FrameSource] = {}
         numbers: dict[str, np.ndarray] = {}
-        for sub in sorted(p for p in folder.iterdir() if p.is_dir()):
-            files = tuple(sorted(f for f in sub.iterdir() if f.suffix.lower() in IMAGE_ENDINGS and f.name[0] != "."))
+        entries = list_folder(folder, CaptureError)
+        for sub in (p for p in entries if p.is_dir()):
+            found = list_folder(sub, CaptureError)
+            files = tuple(f for f in found if f.suffix.lower() in IMAGE_ENDINGS and f.name[0] != ".")
             if not files:
                 continue
             wrong = next((f for f in files if not f.stem.isdecimal()), None)
             if wrong is not None:
                 raise CaptureError(f"{wrong}: expected a frame number as name (000000.png)")
+            check_name(sub.name, str(folder), CaptureError)
             sources[sub.name] = ImageFolder(files)
             numbers[sub.name] = np.array([int(f.stem) for f in files])
-        for file in sorted(folder.iterdir()):
+        for file in entries:
             if file.suffix.lower() in VIDEO_ENDINGS and file.stem not in sources:
                 video = Video(file)
                 sources[file.stem], numbers[file.stem] = video, np.arange(len(video))

@@ -27,7 +27,7 @@ from geomocap.files.images import IMAGE_ENDINGS, ImageFolder, read_image, size_t
 from geomocap.files.rigs import read_rig
 from geomocap.files.videos import VIDEO_ENDINGS, Video
 from geomocap.model.rig import Rig
-from geomocap.reading import read_toml
+from geomocap.reading import check_name, list_folder, read_toml
 from geomocap.settings import LEAST_FPS, MOST_FPS, Settings, explained
 
 PARTS = ("capture.toml", "images", "videos", "background", "masks", "sparse", "bar", "reference")
@@ -314,17 +314,23 @@ def write_capture_info(path: Path, info: CaptureInfo) -> None:
     write_text(path / "capture.toml", tomli_w.dumps(info.model_dump(exclude_none=True)))
 
 
+def _entries(folder: Path) -> list[Path]:
+    return list_folder(folder, CaptureError) if folder.is_dir() else []
+
+
 def _find_sources(path: Path) -> dict[str, FrameSource]:
     sources: dict[str, FrameSource] = {}
-    for folder in sorted(p for p in (path / "images").glob("*") if p.is_dir()):
-        files = tuple(sorted(f for f in folder.iterdir() if f.suffix.lower() in IMAGE_ENDINGS))
+    for folder in (p for p in _entries(path / "images") if p.is_dir()):
+        check_name(folder.name, str(path / "images"), CaptureError)
+        files = tuple(f for f in list_folder(folder, CaptureError) if f.suffix.lower() in IMAGE_ENDINGS)
         for k, file in enumerate(files):
             if file.stem != f"{k:06d}":
                 raise CaptureError(f"{file}: expected frame {k:06d} here; frames count from 000000 without gaps")
         if not files:
             raise CaptureError(f"{folder}: holds no frames (000000.png …)")
         sources[folder.name] = ImageFolder(files)
-    for file in sorted((path / "videos").glob("*")):
+    for file in _entries(path / "videos"):
         if file.suffix.lower() in VIDEO_ENDINGS and file.stem not in sources:
+            check_name(file.stem, str(path / "videos"), CaptureError)
             sources[file.stem] = Video(file)
     return sources

@@ -80,26 +80,48 @@ def _decoded(path: Path, mode: int) -> np.ndarray:
         data = read_bytes(path)
     except OSError as error:
         raise _missing(path, error) from None
+    return _decoded_bytes(data, path, mode)
+
+
+def decode_image(data: bytes, where: str) -> np.ndarray:
+    """Decode an image that stands in another file, (H, W, 3) uint8 RGB; raises CaptureError as `read_image`."""
+    image = _decoded_bytes(data, where, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
+    return image if image.dtype == np.uint8 else _in_eight_bits(image, None, where)
+
+
+def check_image(path: Path) -> None:
+    """Refuse an image file that isn't whole, without decoding it; raises CaptureError as `read_image`."""
+    try:
+        _check_bytes(read_bytes(path), path)
+    except OSError as error:
+        raise _missing(path, error) from None
+
+
+def _check_bytes(data: bytes, where: Path | str) -> None:
     header = image_header(io.BytesIO(data))
     if header is None:
-        raise _damaged(path, len(data))
-    _check_claim(path, header)
+        raise _damaged(where, len(data))
+    _check_claim(where, header)
     if flaw := image_flaw(header, data):
         raise CaptureError(
-            f"{path}: damaged or truncated ({flaw}); copy it again, or put the frame before it in its place"
+            f"{where}: damaged or truncated ({flaw}); copy it again, or put the frame before it in its place"
         )
+
+
+def _decoded_bytes(data: bytes, where: Path | str, mode: int) -> np.ndarray:
+    _check_bytes(data, where)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
     except (cv2.error, MemoryError):
         image = None
     if image is None:
-        raise _damaged(path, len(data))
+        raise _damaged(where, len(data))
     if image.dtype not in (np.uint8, np.uint16):
-        raise CaptureError(f"{path}: holds {image.dtype} values; save it with 8 or 16 bits a colour")
+        raise CaptureError(f"{where}: holds {image.dtype} values; save it with 8 or 16 bits a colour")
     return image
 
 
-def _in_eight_bits(image: np.ndarray, bits: int | None, path: Path) -> np.ndarray:
+def _in_eight_bits(image: np.ndarray, bits: int | None, path: Path | str) -> np.ndarray:
     """Scale an image of 16 bits, of which `bits` are used."""
     largest = int(image.max())
     bits = bits or bits_for(largest)
@@ -169,7 +191,7 @@ def _is_deep(path: Path) -> bool:
     return header is not None and header.bits == 16 and not header.is_too_large
 
 
-def _check_claim(path: Path, header: ImageHeader) -> None:
+def _check_claim(path: Path | str, header: ImageHeader) -> None:
     if header.is_too_large:
         raise CaptureError(
             f"{path}: claims {header.width}×{header.height} pixels, more than {MOST_PIXELS / 1e6:.0f} million; "
@@ -182,6 +204,6 @@ def _missing(path: Path, error: OSError) -> CaptureError:
     return CaptureError(f"{path}: can't be read ({error.strerror or error}); every camera needs every frame")
 
 
-def _damaged(path: Path, length: int) -> CaptureError:
+def _damaged(path: Path | str, length: int) -> CaptureError:
     """Return the error of an image file that holds no whole image."""
     return CaptureError(f"{path}: truncated or no image ({length} bytes); write it again")

@@ -1,9 +1,9 @@
 """Whether the coded blocks of a JPEG are whole.
 
 Decoders go on over damaged blocks and fill the rest of a picture with what comes, with a word on the screen at best.
-Here the codes of a baseline JPEG are followed without making a picture of them (ITU-T T.81, F.2): every code must be one
-of its tables, all blocks must be there with nothing left over, and no coefficient may be larger than a picture of 8 bits
-has.
+Here the codes of a baseline JPEG are followed without making a picture of them (ITU-T T.81, F.2): every code must be
+one of its tables, all blocks must be there with nothing left over, and no coefficient may be larger than a picture of 8
+bits has.
 """
 
 from __future__ import annotations

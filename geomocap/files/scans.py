@@ -29,6 +29,7 @@ from geomocap.files.scan_geometry import (
     read_surface,
 )
 from geomocap.files.scan_settings import ScanSettings
+from geomocap.reading import list_folder
 
 _FARTHEST = 1e5  # diagonals from the origin; ten times farther the equations of motion lose their last digits
 
@@ -166,7 +167,9 @@ def open_scans(source: Path, settings: ScanSettings) -> Scans:
 
 def _sequence(folder: Path) -> list[Path]:
     """List a folder's scans in the order of their numbers; refuse what is not one sequence."""
-    files = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in SCAN_ENDINGS and not p.name.startswith(".")]
+    files = [
+        p for p in list_folder(folder, GeometryError) if p.suffix.lower() in SCAN_ENDINGS and not p.name.startswith(".")
+    ]
     if not files:
         raise GeometryError(f"{folder}: holds no scans ({', '.join(e[1:] for e in SCAN_ENDINGS)})")
     formats = sorted({p.suffix.lower()[1:] for p in files})

@@ -74,10 +74,17 @@ class Rig:
         object.__setattr__(self, "notes", tuple(dict.fromkeys(notes)))
 
     @classmethod
-    def of_file(cls, where: str, names: Iterable[str], cameras: Iterable[pycolmap.Camera], poses: np.ndarray) -> Rig:
+    def of_file(
+        cls,
+        where: str,
+        names: Iterable[str],
+        cameras: Iterable[pycolmap.Camera],
+        poses: np.ndarray,
+        notes: Iterable[str] = (),
+    ) -> Rig:
         """Make a rig of what a file says; errors begin with `where`."""
         try:
-            return cls(tuple(names), tuple(cameras), poses)
+            return cls(tuple(names), tuple(cameras), poses, tuple(notes))
         except CalibrationError as error:
             raise CalibrationError(f"{where}: {error}") from None
 
