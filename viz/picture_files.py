@@ -9,8 +9,11 @@ import open3d as o3d
 
 from geomocap.errors import GeometryError, RunError
 from geomocap.files.frame_files import read_points
+from geomocap.files.geometry_claims import check_faces, check_geometry
 from geomocap.files.open3d_geometry import read_by_open3d
+from geomocap.files.scan_checks import check_points
 from geomocap.model.surface import vertex_normals
+from geomocap.reading import open_plain
 from viz.body_colors import body_colors
 from viz.drawing import sheet, write_png
 from viz.floor import floor
@@ -41,6 +44,7 @@ def load(path: Path) -> Mesh:
         raise GeometryError(f"{path}: no such file")
     if ending not in {*MESHES, *CLOUDS}:
         raise GeometryError(f"{path}: can't be shown; expected {', '.join(sorted({*MESHES, *CLOUDS}))}")
+    check_geometry(path)
     if ending == ".ply" and _is_voxel_grid(path):
         grid = read_by_open3d(o3d.io.read_voxel_grid, path)
         voxels = grid.get_voxels()
@@ -52,24 +56,35 @@ def load(path: Path) -> Mesh:
     if ending in MESHES:
         found = read_by_open3d(o3d.io.read_triangle_mesh, path)
         if found.has_triangles():
-            return _triangles(found)
+            return _triangles(found, path)
     if ending not in CLOUDS:
         raise GeometryError(f"{path}: holds no triangles; is it truncated?")
     try:
         points = read_points(path).finite
     except GeometryError:
         raise GeometryError(f"{path}: holds neither triangles nor points; is it whole?") from None
+    check_points(points.positions, str(path))
     colors = body_colors(points.body) if (points.body >= 0).any() else points.shown_colors
     return gems(points.positions, colors, 0.75 * spacing(points.positions), points.normals)
 
 
 def _is_voxel_grid(path: Path) -> bool:
-    with path.open("rb") as file:
+    with open_plain(path) as file:
         return b"voxel_size" in file.read(4096).split(b"end_header")[0]
 
 
-def _triangles(found: o3d.geometry.TriangleMesh) -> Mesh:
+def _triangles(found: o3d.geometry.TriangleMesh, path: Path) -> Mesh:
     vertices, faces = np.asarray(found.vertices), np.asarray(found.triangles).astype(np.int64)
+    check_faces(faces, len(vertices), path)
+    corners = vertices[faces]
+    good = np.isfinite(corners).all(axis=(1, 2))
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    if not good.any() or not area[good].sum() > 0:
+        raise GeometryError(f"{path}: its triangles have no area; is it whole?")
+    kept = np.unique(faces[good])
+    check_points(vertices[kept], str(path))
+    faces = faces[good]
+    vertices = np.where(np.isfinite(vertices), vertices, vertices[kept[0]])
     colors = np.full((len(faces), 3), (0.62, 0.66, 0.72))
     if found.has_vertex_colors():
         colors = np.asarray(found.vertex_colors)[faces].mean(axis=1)

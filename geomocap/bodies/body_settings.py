@@ -11,7 +11,11 @@ class MotionBodiesSettings(Settings):
     """How rigid bodies are found from motion paths."""
 
     bodies: int = Field(
-        default=0, ge=0, description="number of bodies; 0: found automatically", json_schema_extra={"flag": "bodies"}
+        default=0,
+        ge=0,
+        le=100,
+        description="number of bodies; 0: found automatically",
+        json_schema_extra={"flag": "bodies"},
     )
     min_turn_deg: float = Field(
         default=15.0,

@@ -42,7 +42,9 @@ class CaptureInfo(Settings):
     fps: float = Field(ge=LEAST_FPS, le=MOST_FPS, description="frames per second")
     length_unit: Literal["m"] = Field("m", description="unit of the calibration")
     up: Literal["y", "z"] = Field("z", description="world axis that points up")
-    cameras: tuple[str, ...] | None = Field(None, description="the cameras to use, in this order; all if not given")
+    cameras: tuple[str, ...] | None = Field(
+        None, min_length=1, description="the cameras to use, in this order; all if not given"
+    )
     frames: tuple[int, int] | None = Field(
         None, description="the first and the last frame to use, of what was recorded; all if not given"
     )
@@ -260,6 +262,8 @@ class Capture:
         """
         if not self.is_calibrated:
             raise CaptureError(f"{self.path}: not calibrated, no folder sparse/; run `geomocap calibrate {self.path}`")
+        if len(self.cameras) < 2:
+            raise CaptureError(f"{self.path}: one camera, {self.cameras[0]}, can't measure depth; take two or more")
         rig = read_rig(self.path / "sparse", self.cameras)
         for name, (w, h) in zip(rig.names, rig.sizes, strict=True):
             size = self.sources[name].size

@@ -11,10 +11,11 @@ import trimesh
 
 from geomocap.errors import GeometryError
 from geomocap.files.frame_files import read_voxels
+from geomocap.files.geometry_claims import check_faces, check_geometry
 from geomocap.files.npz import array_names, read_arrays
-from geomocap.files.open3d_geometry import check_ply, read_by_open3d
+from geomocap.files.open3d_geometry import read_by_open3d
 from geomocap.files.ragged_arrays import spread_over_frames
-from geomocap.reading import reason, shortened
+from geomocap.reading import open_plain, reason, shortened
 
 MESH_ENDINGS = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 CLOUD_ENDINGS = (".ply", ".pcd", ".xyz", ".pts")
@@ -98,17 +99,21 @@ def read_surface(path: Path) -> ScanSurface:
     if suffix in ARRAY_ENDINGS:
         return ScanSurface(read_array(path))
     if suffix == ".ply":
-        check_ply(path)
+        check_geometry(path)
         if _is_voxel_grid(path):
             return ScanSurface(read_voxels(path).points)
     try:
         if suffix in MESH_ENDINGS:
+            check_geometry(path)
             mesh = trimesh.load(path, process=False, force="mesh")
             if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+                check_faces(mesh.faces, len(mesh.vertices), path)
                 return ScanSurface(np.asarray(mesh.vertices, float), np.asarray(mesh.faces))
         cloud = read_by_open3d(o3d.io.read_point_cloud, path) if suffix in CLOUD_ENDINGS else None
+    except GeometryError:
+        raise
     except Exception as error:
-        raise GeometryError(f"{path}: can't be read as a scan ({str(error).splitlines()[0]})") from None
+        raise GeometryError(f"{path}: can't be read as a scan ({reason(error)})") from None
     if cloud is None or not cloud.has_points():
         raise GeometryError(f"{path}: holds neither triangles nor points; is it whole?")
     return ScanSurface(np.asarray(cloud.points))
@@ -151,6 +156,6 @@ def read_array(path: Path) -> np.ndarray:
 
 
 def _is_voxel_grid(path: Path) -> bool:
-    with path.open("rb") as file:
+    with open_plain(path) as file:
         header = file.read(2048)
     return b"element origin" in header or b"voxel_size" in header
