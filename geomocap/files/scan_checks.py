@@ -15,7 +15,7 @@ USUAL = (0.02, 50.0)  # metres across; beyond, they are likely in other units
 STRAY = 1000.0  # times as far from the middle as most points: one that was never measured
 OTHER_SIZE = 10.0  # times larger or smaller than the others: another unit, or another thing
 JUMP = 10.0  # times its own size from one frame to the next
-THIN = 1e-6  # of its length is the width of a line, and the thickness of a plane
+THIN = 1e-5  # of its length is the width of a line, and the thickness of a plane
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,9 @@ class ScanShape:
         """Describe finite points (N, 3)."""
         middle = np.median(points, axis=0)
         low, high = np.percentile(points, (5, 95), axis=0)
-        return cls(
-            middle,
-            float(np.linalg.norm(high - low)),
-            np.linalg.svd((points - points.mean(axis=0)) / max(len(points), 1) ** 0.5, compute_uv=False),
-        )
+        about = points - points.mean(axis=0)
+        sides = np.sqrt(np.maximum(np.linalg.eigvalsh(about.T @ about / len(points))[::-1], 0))
+        return cls(middle, float(np.linalg.norm(high - low)), sides)
 
 
 def check_points(points: np.ndarray, name: str) -> None:
@@ -88,7 +86,7 @@ def scan_doubts(
     Raises
     ------
     GeometryError
-        If one is of another size than the others, or in another place than those before and after it.
+        If one is of another size than the others, in another place than the one before it, or a line.
     """
     shapes = []
     for frame, name in enumerate(names):
@@ -103,6 +101,8 @@ def scan_doubts(
                 f"{name}: is {shape.size:.3g} m across, the scans are {usual:.3g} m usually; "
                 "is it in another unit, or of something else?"
             )
+        if shape.sides[1] <= THIN * shape.sides[0]:
+            raise GeometryError(f"{name}: all its points lie in a line; there is no surface in it")
     for k in range(1, len(shapes)):
         step = float(np.linalg.norm(shapes[k].middle - shapes[k - 1].middle))
         if step > JUMP * usual:
@@ -115,7 +115,10 @@ def scan_doubts(
         doubts.append(
             f"the scans are {usual:.3g} m across, which are likely no metres; set scans.scale, 0.001 for millimetres"
         )
-    return (*doubts, *_flat(shapes, names))
+    if flat := [name for name, shape in zip(names, shapes, strict=True) if shape.sides[2] <= THIN * shape.sides[0]]:
+        more = f", and those of {len(flat) - 1} more scans" if len(flat) > 1 else ""
+        doubts.append(f"{flat[0]}: its points{more} lie in a plane; how bodies turn is doubtful there")
+    return tuple(doubts)
 
 
 def check_spacing(spacing: float, measured: float, points: np.ndarray) -> None:
@@ -137,19 +140,3 @@ def _checked(points: np.ndarray, name: str) -> np.ndarray:
     if not len(points):
         raise GeometryError(f"{name}: holds no points")
     return points
-
-
-def _flat(shapes: list[ScanShape], names: tuple[str, ...]) -> list[str]:
-    """Name the scans that have no surface or no depth."""
-    doubts = []
-    for what, side in (("in a line", 1), ("in a plane", 2)):
-        flat = [
-            k
-            for k, shape in enumerate(shapes)
-            if shape.sides[0] > 0 and shape.sides[side] <= THIN * shape.sides[0] and len(shape.sides) == 3
-        ]
-        if flat:
-            more = f" and of {len(flat) - 1} more scans" if len(flat) > 1 else ""
-            doubts.append(f"{names[flat[0]]}: its points{more} lie {what}; bodies can't be told by them")
-            break
-    return doubts

@@ -98,13 +98,11 @@ def read_surface(path: Path) -> ScanSurface:
     suffix = path.suffix.lower()
     if suffix in ARRAY_ENDINGS:
         return ScanSurface(read_array(path))
-    if suffix == ".ply":
-        check_geometry(path)
-        if _is_voxel_grid(path):
-            return ScanSurface(read_voxels(path).points)
+    check_geometry(path)
+    if suffix == ".ply" and _is_voxel_grid(path):
+        return ScanSurface(read_voxels(path).points)
     try:
         if suffix in MESH_ENDINGS:
-            check_geometry(path)
             mesh = trimesh.load(path, process=False, force="mesh")
             if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
                 check_faces(mesh.faces, len(mesh.vertices), path)
