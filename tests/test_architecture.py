@@ -44,7 +44,7 @@ ROOMS: dict[str, set[str]] = {
     # out of the house
     "export": VALUES | {"files", "skeleton", "subject", "version"},
     "evaluation": VALUES | {"carving", "files", "export", "skeleton", "subject"},
-    "inspection": VALUES | {"files", "export", "evaluation"},
+    "inspection": VALUES | {"files", "export", "evaluation", "subject"},
 }
 ROOMS["config"] = set(ROOMS)
 ROOMS["pipeline"] = set(ROOMS)

@@ -14,6 +14,8 @@ from geomocap.cli.settings_options import with_settings
 from geomocap.config import Config
 from geomocap.export.names import Names
 from geomocap.export.run_export import Exported, export_run
+from geomocap.files.result_schemas import skeleton_gaps
+from geomocap.files.results import read_skeleton
 from geomocap.files.run import Run
 
 
@@ -54,6 +56,8 @@ def export(
             Run(run), formats, settings, names=Names.read(names) if names else None, folder=out, progress=progress
         )
     report_exported(exported)
+    for gap in skeleton_gaps(read_skeleton(Run(run))):
+        console.print(f"note: {gap}")
 
 
 def report_exported(exported: Exported) -> None:

@@ -88,7 +88,8 @@ def _check_values(name: str, values: np.ndarray, expected: Expected, known: dict
     high = known[expected.high] - 1 if isinstance(expected.high, str) else expected.high
     if len(there) and not (expected.low <= there.min() and there.max() <= high):
         wrong = there.min() if there.min() < expected.low else there.max()
-        raise GeometryError(f"{name} holds {wrong:.6g}, expected {expected.low:g} to {high:g}")
+        verb = "holds" if expected.shape else "is"
+        raise GeometryError(f"{name} {verb} {wrong:.6g}, expected {expected.low:g} to {high:g}")
     if expected.kind == "rotation":
         _check_rotations(name, values[~missing.any(axis=(-2, -1))])
     elif expected.kind == "direction":

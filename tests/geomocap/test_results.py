@@ -75,7 +75,7 @@ def test_joints_of_a_skeleton_may_come_in_any_order(tmp_path):
         ({"joint_bodies": np.array([[0, 1]] * 6)}, "6 joints between 7 bodies make no tree"),
         ({"joint_positions": np.zeros((20, 5, 3))}, r"joint_positions has the shape \(20, 5, 3\), expected 20 × 6 × 3"),
         ({"body_rotations": np.zeros((0, 7, 3, 3))}, "body_positions has the shape"),
-        ({"fps": np.array(0.0)}, "fps holds 0, expected"),
+        ({"fps": np.array(0.0)}, "fps is 0, expected"),
     ],
 )
 def test_broken_skeletons_are_named_with_their_file(tmp_path, change, says):
