@@ -70,7 +70,9 @@ def read_easymocap(
         R, r, t = (extrinsic.matrix(f"{k}_{name}") for k in ("Rot", "R", "T"))
         if t is None or (R is None and r is None):
             raise CalibrationError(f"{where}: extri.yml has no R_{name} or Rot_{name}, and T_{name}")
-        poses.append(_pose(R if R is not None else r, t, metres_per_unit, where))
+        turn_given = R if R is not None else r
+        assert turn_given is not None
+        poses.append(_pose(turn_given, t, metres_per_unit, where))
         if R is not None and r is not None and r.size == 3:
             turn = Rotation.from_rotvec(np.ravel(r)).as_matrix()
             if np.abs(turn - R).max() > 1e-4:

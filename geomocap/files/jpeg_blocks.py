@@ -201,7 +201,7 @@ def follow_codes(
                 while bits < 32:
                     byte = 0
                     if at + 1 < len(data) and (data[at] != 0xFF or data[at + 1] == 0):
-                        byte = np.int64(data[at])
+                        byte = int(data[at])
                         at += 2 if byte == 0xFF else 1
                     else:
                         beyond += 8

@@ -117,6 +117,8 @@ class SubjectModel:
             raise GeometryError(f"colors has the shape {self.colors.shape}, expected {sizes['P']} × 3 or none")
         if not sizes["P"] or not sizes["K"]:
             raise GeometryError("it has no surface points or no poses")
+        if not self.normals.any():
+            raise GeometryError("normals are all zero")
         if not np.allclose(self.skin_weights.sum(axis=1), 1, atol=0.01):
             raise GeometryError("skin_weights doesn't sum to one at every point")
         across = float(np.linalg.norm(np.ptp(self.points, axis=0)))
