@@ -14,6 +14,7 @@ from geomocap.errors import SettingsError
 from geomocap.reading import read_toml, shortened
 
 Model = TypeVar("Model", bound="Settings")
+MOST_COUNTED, MOST_MEASURED = 10_000_000, 1e9  # of any setting: things counted, and metres, pixels, degrees
 LEAST_FPS, MOST_FPS = 0.001, 1e6  # from one picture in a quarter of an hour to the fastest cameras
 
 
@@ -35,6 +36,26 @@ class Settings(BaseModel):
         if types & {int, float} and bool not in types and _holds_truth(value):
             raise PydanticCustomError("truth_for_number", "must be a number, not true or false")
         return value
+
+    @field_validator("*")
+    @classmethod
+    def _within_reason(cls, value: Any) -> Any:
+        """Refuse numbers that nothing in a recording has: they would only take all memory, or all time."""
+        for number in _numbers(value):
+            most = MOST_COUNTED if isinstance(number, int) else MOST_MEASURED
+            if abs(number) > most:
+                raise PydanticCustomError(
+                    "beyond_reason", "must lie between {least} and {most}", {"least": -most, "most": most}
+                )
+        return value
+
+
+def _numbers(value: Any) -> Iterator[int | float]:
+    if isinstance(value, list | tuple):
+        for item in value:
+            yield from _numbers(item)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield value
 
 
 def _types(annotation: Any) -> set[Any]:
