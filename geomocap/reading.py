@@ -10,15 +10,27 @@ import json
 import os
 import stat
 import tomllib
-import unicodedata
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from geomocap.errors import GeomocapError
+from geomocap.errors import GeomocapError, harmless, shortened
+
+__all__ = [
+    "check_name",
+    "harmless",
+    "list_folder",
+    "open_plain",
+    "parse_toml",
+    "read_bytes",
+    "read_json",
+    "read_text",
+    "read_toml",
+    "reason",
+    "shortened",
+]
 
 MOST_TEXT = 1 << 24  # bytes of a settings file or record; a thousand times what any of them needs
 LONGEST_NAME = 100  # characters; with an ending still a file name on every disk
-_SHOWN = 80  # characters of a name in a message
 
 
 def open_plain(path: Path) -> BinaryIO:
@@ -114,22 +126,6 @@ def reason(failed: BaseException) -> str:
         return "a number with thousands of digits"
     lines = [line.strip() for line in str(failed).splitlines() if line.strip()]
     return harmless(shortened(lines[0] if lines else type(failed).__name__, 120))
-
-
-def shortened(text: str, most: int = _SHOWN) -> str:
-    """Return a text, without its middle if it is long."""
-    return text if len(text) <= most else f"{text[: most // 2]} … {text[-most // 2 :]}"
-
-
-def harmless(text: str) -> str:
-    r"""Write what a terminal or page would obey as `\x1b`: control characters, turned directions, broken UTF-8."""
-    return "".join(c if c == "\n" or c.isprintable() or c == "\t" else _escaped(c) for c in text)
-
-
-def _escaped(character: str) -> str:
-    if unicodedata.category(character) == "Zs":  # unusual spaces are harmless
-        return character
-    return character.encode("unicode_escape").decode("ascii")
 
 
 def check_name(name: str, where: str, error: type[GeomocapError], what: str = "camera") -> None:

@@ -102,11 +102,9 @@ def read_surface(path: Path) -> ScanSurface:
     if suffix == ".ply" and _is_voxel_grid(path):
         return ScanSurface(read_voxels(path).points)
     try:
-        if suffix in MESH_ENDINGS:
-            mesh = trimesh.load(path, process=False, force="mesh")
-            if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-                check_faces(mesh.faces, len(mesh.vertices), path)
-                return ScanSurface(np.asarray(mesh.vertices, float), np.asarray(mesh.faces))
+        mesh = read_mesh(path) if suffix in MESH_ENDINGS else None
+        if mesh is not None:
+            return ScanSurface(np.asarray(mesh.vertices, float), np.asarray(mesh.faces))
         cloud = read_by_open3d(o3d.io.read_point_cloud, path) if suffix in CLOUD_ENDINGS else None
     except GeometryError:
         raise
@@ -115,6 +113,29 @@ def read_surface(path: Path) -> ScanSurface:
     if cloud is None or not cloud.has_points():
         raise GeometryError(f"{path}: holds neither triangles nor points; is it whole?")
     return ScanSurface(np.asarray(cloud.points))
+
+
+def read_mesh(path: Path) -> trimesh.Trimesh | None:
+    """Read the triangles of a file; None if it has none.
+
+    Raises
+    ------
+    GeometryError
+        If the file claims more than it holds, can't be read, or has triangles of vertices that aren't there.
+    """
+    check_geometry(path)
+    try:
+        mesh = trimesh.load(path, process=False, force="mesh")
+        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+            return None
+        if np.shape(mesh.vertices)[1:] != (3,) or np.shape(mesh.faces)[1:] != (3,):
+            raise GeometryError(f"{path}: its vertices have {np.shape(mesh.vertices)[1:]} coordinates; make it again")
+        check_faces(mesh.faces, len(mesh.vertices), path)
+        return mesh
+    except GeometryError:
+        raise
+    except Exception as error:
+        raise GeometryError(f"{path}: can't be read as a scan ({reason(error)})") from None
 
 
 def holds_tracks(path: Path) -> bool:
