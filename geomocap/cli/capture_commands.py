@@ -120,6 +120,8 @@ def convert(
 ) -> None:
     """Convert a calibration between the formats of aniposelib, caliscope, Pose2Sim, OpenCV, EasyMocap and COLMAP."""
     rig = convert_calibration(source, target, kind, metres_per_unit=metres_per_unit)
+    for note in rig.notes:
+        console.print(f"note: {note}")
     console.print(f"{target}: {len(rig)} cameras")
 
 

@@ -33,11 +33,14 @@ class PosedImage:
         Number of its camera.
     pose : (3, 4) float
         Camera from world.
+    off : float
+        By how much its quaternion's length differs from one, as written; it is made one.
     """
 
     name: str
     camera: int
     pose: np.ndarray
+    off: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -210,7 +213,7 @@ def _image(name: str, camera: int, values: list[float], where: str) -> PosedImag
     if abs(length - 1) > NOT_UNIT:
         raise CalibrationError(f"{place}: its rotation is no unit quaternion (length {length:.4g}); write it again")
     rotation = Rotation.from_quat(quaternion / length, scalar_first=True).as_matrix()
-    return PosedImage(name, camera, np.column_stack([rotation, translation]))
+    return PosedImage(name, camera, np.column_stack([rotation, translation]), abs(length - 1))
 
 
 def _integer(word: str, where: str) -> int:

@@ -208,7 +208,7 @@ def follow_codes(
                     held = ((held & 0xFFFFFFFFFF) << 8) | byte
                     bits += 8
                 next16 = (held >> (bits - 16)) & 0xFFFF
-                entry = dc[c, next16] if k == 0 else ac[c, next16]
+                entry = int(dc[c, next16]) if k == 0 else int(ac[c, next16])
                 if entry == 0:
                     return unit, 2 if beyond > bits - 16 else 1, at
                 bits -= entry >> 8

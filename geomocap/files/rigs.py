@@ -10,6 +10,7 @@ import pycolmap
 
 from geomocap.errors import CalibrationError
 from geomocap.files.colmap_model import read_colmap_model
+from geomocap.model.orientations import NOTED
 from geomocap.model.rig import Rig
 from geomocap.reading import check_name
 
@@ -31,6 +32,7 @@ def read_rig(sparse: Path, names: Sequence[str] | None = None) -> Rig:
     """
     model = read_colmap_model(sparse)
     found: dict[str, tuple[pycolmap.Camera, np.ndarray]] = {}
+    notes: dict[str, str] = {}
     for image in sorted(model.images, key=lambda i: i.name):
         name = image.name.split("/")[0] if "/" in image.name else Path(image.name).stem
         check_name(name, str(sparse), CalibrationError)
@@ -42,6 +44,8 @@ def read_rig(sparse: Path, names: Sequence[str] | None = None) -> Rig:
                 f"{sparse}: images of camera {name} have different poses, but cameras must not move; "
                 f"keep one image {name}/<anything>"
             )
+        if image.off > NOTED:
+            notes[name] = f"camera {name}: its quaternion is of unit length to {image.off:.1g} only; it is taken as one"
         found.setdefault(name, (model.cameras[image.camera], pose))
     wanted = tuple(sorted(found)) if names is None else tuple(names)
     for name in wanted:
@@ -50,7 +54,7 @@ def read_rig(sparse: Path, names: Sequence[str] | None = None) -> Rig:
                 f"{sparse}: no posed image of camera {name}; the model has {', '.join(sorted(found)) or 'none'}"
             )
     cameras, poses = [found[n][0] for n in wanted], [found[n][1] for n in wanted]
-    return Rig.of_file(str(sparse), wanted, cameras, np.array(poses).reshape(-1, 3, 4))
+    return Rig.of_file(str(sparse), wanted, cameras, np.array(poses).reshape(-1, 3, 4), notes.values())
 
 
 def colmap_model(rig: Rig) -> pycolmap.Reconstruction:
