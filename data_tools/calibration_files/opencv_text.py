@@ -57,6 +57,8 @@ class OpenCVFile:
     def texts(self, key: str) -> list[str]:
         """Return a list of texts; empty if there is none."""
         found = self.content.get(key)
+        if isinstance(found, str):  # XML writes them one after the other
+            return [a or b for a, b in re.findall(r'"([^"]*)"|(\S+)', found)]
         return [t for t in found if isinstance(t, str)] if isinstance(found, list) else []
 
     def _as_matrix(self, key: str, node: Any) -> np.ndarray:
@@ -93,7 +95,7 @@ def read_opencv_file(file: Path) -> OpenCVFile:
         elif start == "{":
             content = _json(json.loads(text), 0)
         else:
-            content = _Lines.of(text).block(0, 0)
+            content = _Lines.of(text).whole()
     except (ValueError, ElementTree.ParseError, RecursionError) as error:
         raise CalibrationError(f"{file}: no readable OpenCV file ({reason(error)})") from None
     if not isinstance(content, dict):
@@ -146,6 +148,13 @@ class _Lines:
             if plain.strip() and not plain.startswith(("%", "---", "...")):
                 found.append((len(plain) - len(plain.lstrip()), plain.strip(), number))
         return cls(found)
+
+    def whole(self) -> Any:
+        """Read all lines."""
+        found = self.block(0, 0)
+        if self.at < len(self.lines):
+            raise ValueError(f"line {self.lines[self.at][2]}: its indentation is wrong")
+        return found
 
     def block(self, indent: int, depth: int) -> Any:
         """Read what stands at this indentation or deeper: keys, items, or one value."""

@@ -12,6 +12,7 @@ NOTED = 1e-5  # beyond, it is said that the nearest one was taken
 WRITTEN = 1e-3  # beyond, it is no rotation; published ones have six digits, a few have three
 LONGEST_SIDE = 65535  # pixels of an image; no format of pictures holds more
 SHORTEST, LONGEST = 0.02, 1e4  # focal lengths as fractions of an image's longer side: 175° and 0.006° across
+_GRID = 17  # points along each side of the image at which that is tried
 UNDONE = 0.5  # fraction of the image in which a lens' distortion must be removable
 
 
@@ -78,11 +79,17 @@ def check_camera(camera: pycolmap.Camera, where: str) -> None:
 
 
 def _undone(camera: pycolmap.Camera) -> float:
-    """Fraction of the image in which the distortion is removed and put back to the same pixel."""
-    u, v = np.meshgrid(np.linspace(0, camera.width, 9), np.linspace(0, camera.height, 9))
+    """Fraction of the image in which the distortion is removed, put back to the same pixel, and neighbours stay so."""
+    u, v = np.meshgrid(np.linspace(0, camera.width, _GRID), np.linspace(0, camera.height, _GRID))
     pixels = np.column_stack([u.ravel(), v.ravel()])
     with np.errstate(all="ignore"):
         seen = np.asarray(camera.cam_from_img(pixels), dtype=np.float64).reshape(len(pixels), -1)[:, :2]
         good = np.isfinite(seen).all(axis=1) & (np.abs(seen) < 1e6).all(axis=1)
-        again = np.asarray(camera.img_from_cam(np.column_stack([seen[good], np.ones(good.sum())])), dtype=np.float64)
-        return float((np.abs(again - pixels[good]).max(axis=1, initial=0) < 1).sum() / len(pixels))
+        seen[~good] = np.nan
+        again = np.asarray(camera.img_from_cam(np.column_stack([seen, np.ones(len(seen))])), dtype=np.float64)
+        good &= np.abs(again - pixels).max(axis=1) < 1
+        seen[~good] = np.nan
+        grid = seen.reshape(_GRID, _GRID, 2)
+        across, down = grid[:-1, 1:] - grid[:-1, :-1], grid[1:, :-1] - grid[:-1, :-1]
+        upright = (across[..., 0] > 0) & (down[..., 1] > 0)
+        return float((upright & (across[..., 0] * down[..., 1] > across[..., 1] * down[..., 0])).mean())
