@@ -74,10 +74,12 @@ def _check_shape(name: str, shape: tuple[int, ...], expected: Expected, known: d
 
 
 def _check_values(name: str, values: np.ndarray, expected: Expected, known: dict[str, int]) -> None:
+    if not values.size:
+        return
     kind = values.dtype.kind
     if kind not in _KINDS[expected.kind] and not (expected.kind == "whole" and kind == "f" and _is_whole(values)):
         raise GeometryError(f"{name} holds {values.dtype.name} values, expected {_WORDS[expected.kind]}")
-    if kind not in "fiu" or not values.size:
+    if kind not in "fiu":
         return
     missing = np.isnan(values) if kind == "f" else np.zeros(values.shape, bool)
     if missing.any() and not expected.gaps:
