@@ -8,6 +8,7 @@ from pathlib import Path
 
 from geomocap.cli.execution import executor_for
 from geomocap.cli.progress_bars import progress_bars
+from geomocap.cli.reports import agreeing_job
 from geomocap.config import Config
 from geomocap.errors import RunError
 from geomocap.files.capture import Capture
@@ -26,7 +27,8 @@ def capture_job(
     _check_apart(capture, run)
     _check_model(model, run)
     with executor_for(workers, scheduler) as executor, progress_bars() as progress:
-        yield Job(Run(run), config, executor, progress, capture=opened, fps=opened.fps, model=model)
+        job = Job(Run(run), config, executor, progress, capture=opened, fps=opened.fps, model=model)
+        yield agreeing_job(job)
 
 
 @contextmanager

@@ -8,9 +8,11 @@ from pathlib import Path
 from geomocap.cli.console import console
 from geomocap.errors import GeomocapError
 from geomocap.files.atomic import fingerprint
+from geomocap.files.camera_file import read_camera_doubts
 from geomocap.files.capture import Capture
 from geomocap.files.results import read_cloud_record
 from geomocap.files.run import Run, stage_key
+from geomocap.pipeline.camera_stage import agreeing, without_left_out
 from geomocap.pipeline.cloud_stage import measure_again
 from geomocap.pipeline.job import Job
 from geomocap.progress import Progress, silent
@@ -35,13 +37,21 @@ def review_run(run: Run, capture: Capture | None, progress: Progress = silent) -
     return review(run, capture, measured=partial(measure_again, run, capture), progress=progress)
 
 
+def agreeing_job(job: Job) -> Job:
+    """Check the cameras of a job, print what is doubtful, and return it without those that are to be left out."""
+    job, warnings = agreeing(job)
+    for warning in warnings:
+        console.print(f"warning: {warning}", markup=False)
+    return job
+
+
 def capture_of(run: Run) -> Capture | None:
     """Open the capture that a run was made from; None if there was none or it has gone."""
     source = run.read_record().get("source", {})
     if source.get("kind") != "capture":
         return None
     try:
-        return Capture.open(Path(source["path"]))
+        return without_left_out(Capture.open(Path(source["path"])), read_camera_doubts(run))
     except GeomocapError as error:
         console.print(f"note: the capture can't be shown ({error})")
         return None

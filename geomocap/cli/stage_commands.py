@@ -18,7 +18,7 @@ Fps = Annotated[float, typer.Option("--fps", min=0.001, help="Scans per second."
 BODIES = ("segmentation", "skeleton", "nodes", "motion_bodies", "motion_skeleton", "refinement", "following")
 
 
-@with_settings("silhouettes")
+@with_settings("cameras", "silhouettes")
 def silhouettes(
     capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
 ) -> None:
@@ -30,7 +30,7 @@ def silhouettes(
         pipeline.silhouettes(job)
 
 
-@with_settings("silhouettes", "carving")
+@with_settings("cameras", "silhouettes", "carving")
 def voxels(
     capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
 ) -> None:
@@ -42,7 +42,7 @@ def voxels(
         pipeline.voxels(job)
 
 
-@with_settings("silhouettes", "carving", "cloud")
+@with_settings("cameras", "silhouettes", "carving", "cloud")
 def cloud(
     capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
 ) -> None:
@@ -56,7 +56,7 @@ def cloud(
     tell_clouds(job.run)
 
 
-@with_settings("silhouettes", "carving", "tracking", "filters", "smoothing")
+@with_settings("cameras", "silhouettes", "carving", "tracking", "filters", "smoothing")
 def track(
     capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
 ) -> None:
@@ -93,7 +93,7 @@ def segment(
     tell_results(run)
 
 
-@with_settings("silhouettes", "carving", "cloud", "tracking", "filters", "smoothing", *BODIES, "export")
+@with_settings("cameras", "silhouettes", "carving", "cloud", "tracking", "filters", "smoothing", *BODIES, "export")
 def run(
     capture: CaptureFolder,
     run: RunFolder,

@@ -38,7 +38,16 @@ def clouds(job: Job) -> str:
     bounds = bounds_of(capture, settings)
     before = {"hull": voxels, "silhouettes": silhouettes, "none": lambda _: ""}[bounds](job)
     pictures = capture.fingerprint("images", "videos", "sparse")
-    key = stage_key(__name__, "cloud", bounds, before, pictures, settings.model_dump(), capture.info.region_of_interest)
+    key = stage_key(
+        __name__,
+        "cloud",
+        bounds,
+        before,
+        pictures,
+        settings.model_dump(),
+        capture.info.region_of_interest,
+        capture.cameras,
+    )
 
     def work() -> int:
         missing = [k for k in range(capture.n_frames) if not job.run.frame_file("cloud", k).exists()]

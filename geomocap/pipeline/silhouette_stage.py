@@ -34,6 +34,7 @@ def silhouettes(job: Job) -> str:
         str(capture.path.resolve()),
         capture.fingerprint("images", "videos", "background", "masks", "sparse"),
         job.config.silhouettes.model_dump(),
+        capture.cameras,
     )
     job.write_record("silhouettes")
     return job.stage("silhouettes", key, ["silhouettes"], lambda: _make_silhouettes(job, capture))
