@@ -6,7 +6,7 @@ each camera decides alone; who contradicts the others is named (`silhouettes.con
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
@@ -57,12 +57,18 @@ class CameraLook:
     masks : tuple of F arrays (H, W) uint8 or None
         Silhouettes.
     warnings : tuple of str
+    blank : bool
+        Whether its pictures show nothing.
+    plate, median : (H, W, 3) uint8 or None
+        Background picture, and what the frames show mostly.
     """
 
     scene: SilhouetteScene | None
     masks: tuple[np.ndarray, ...] | None
     warnings: tuple[str, ...] = ()
     blank: bool = False
+    plate: np.ndarray | None = None
+    median: np.ndarray | None = None
 
 
 def check_cameras_of(
@@ -88,6 +94,7 @@ def check_cameras_of(
     look = _Look(capture, tuple(frames), settings or SilhouetteSettings())
     looks = list(map_items(look, capture.cameras, executor, "cameras", progress, 4))
     warnings = [w for found in looks for w in found.warnings]
+    warnings += mixed_up(dict(zip(capture.cameras, looks, strict=True)))
     odd = [] if rig is None else [n for n, c in zip(rig.names, rig.cameras, strict=True) if c.mean_focal_length() <= 0]
     blank = [name for name, found in zip(capture.cameras, looks, strict=True) if found.blank]
     seen = {
@@ -114,6 +121,34 @@ def check_cameras_of(
     )
 
 
+def mixed_up(looks: Mapping[str, CameraLook]) -> list[str]:
+    """Name background pictures that another camera's pictures look much more like than the camera's own."""
+    found = []
+    for name, look in looks.items():
+        if look.plate is None or look.median is None:
+            continue
+        own = _difference(look.median, look.plate)
+        others = {
+            other: _difference(there.median, look.plate)
+            for other, there in looks.items()
+            if other != name and there.median is not None and there.median.shape == look.plate.shape
+        }
+        other = min(others, key=lambda n: others[n], default=name)
+        if own > FLAT and others.get(other, own) < own / 2:
+            found.append(f"background/{name}.png: camera {other} sees that, not camera {name}")
+    return found
+
+
+def _difference(image: np.ndarray, plate: np.ndarray) -> float:
+    """Median difference of two pictures but for the light; what covers less than half of them doesn't count."""
+    difference = image.astype(np.float32) - plate
+    return float(np.median(np.abs(difference - np.median(difference, axis=(0, 1)))))
+
+
+def _is_grey(image: np.ndarray) -> bool:
+    return int(np.ptp(image[..., :3].astype(np.int16), axis=-1).max()) <= FLAT
+
+
 @dataclass(frozen=True)
 class _Look:
     """Looks at one camera by itself."""
@@ -130,8 +165,11 @@ class _Look:
         if max(int(np.ptp(image)) for image in images) <= FLAT:
             return CameraLook(None, None, (f"camera {camera}: its pictures show nothing but one colour",), True)
         warnings = []
+        plate = None
         if capture.has_background(camera):
             plate = self._shrink(camera, capture.background(camera))
+            if _is_grey(plate) and not _is_grey(np.concatenate(images)):
+                warnings.append(f"background/{camera}.png: is grey, the pictures of the camera are in colour")
             if (plate[..., 3] > 127).mean() < 0.5:
                 warnings.append(f"background/{camera}.png: most of it is transparent, so the background isn't known")
             model = model_from_plate(plate, images, self.settings, camera)
@@ -158,7 +196,8 @@ class _Look:
                 f"background/{camera}.png: differs from all pictures of the camera in {always:.0%} of the picture; is "
                 "it of this camera and this recording?"
             )
-        return CameraLook(scene, masks, tuple(warnings))
+        median = np.median(images, axis=0).astype(np.uint8)
+        return CameraLook(scene, masks, tuple(warnings), False, None if plate is None else plate[..., :3], median)
 
     def silhouette(self, camera: str, frame: int, scene: SilhouetteScene | None) -> np.ndarray:
         """Silhouette of a frame in a small image, (H, W) uint8."""

@@ -4,7 +4,8 @@ What the others deny of each silhouette (`ray_agreement.unexplained`), averaged 
 contradiction of a recording. A camera is at fault if that falls to less than half once something is done to it alone:
 its images are turned, mirrored, enlarged, inverted, changed for another camera's or for those of another moment. Then
 that is what is wrong with it. If no such remedy helps, it is at fault if without it the contradiction falls to less
-than half, and more than half of what it sees, or of what the others see, is denied.
+than half, and more than half of what it sees, or of what the others see, is denied, or a tenth of both: a silhouette
+with mistakes is denied where it has too much, or denies where it lacks something; one in the wrong place does both.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from geomocap.carving.silhouette_views import PinholeViews, Undistortion
 from geomocap.silhouettes.ray_agreement import unexplained
 
 CLEAR = 0.01  # of the silhouettes: less contradiction than this comes from pixels
+DISPLACED = 0.1  # of silhouettes: what is missed or added by mistake is denied on one side only, not on both
 MANY = 4  # cameras from which on one may be set aside to judge the others
 LAGS = (1, 3, 9, 27)  # frames by which a camera may be late or early
 
@@ -161,7 +163,8 @@ class Evidence:
         def turned(image: np.ndarray) -> np.ndarray:
             return np.asarray(cv2.warpAffine(image, matrix, (w, h), flags=cv2.INTER_NEAREST))
 
-        return self.replaced(camera, [turned(m) for m in own], turned(self.seen[camera]))
+        shrunk = abs(np.linalg.det(turn)) < 1  # what is beyond a smaller image is background
+        return self.replaced(camera, [turned(m) for m in own], None if shrunk else turned(self.seen[camera]))
 
     def swapped(self, a: int, b: int) -> Evidence:
         """Return this with the silhouettes of two cameras, whose images have one size, changed for each other."""
@@ -254,7 +257,7 @@ def _worst(
         return Contradiction(wrong, best.what, mean(best.before), mean(best.after)), best.evidence, rest
     for k in at_fault[:1]:
         own, theirs = mean(before[:, k]), mean((before - without[k])[:, others[k]])
-        if max(own, theirs) > 0.5:
+        if max(own, theirs) > 0.5 or min(own, theirs) > DISPLACED:
             what = f"the others deny {own:.0%} of what it sees, and it denies {theirs:.0%} of what they see"
             if evidence.surrounding(k):
                 what = f"it takes {np.mean(evidence.of_camera(k)):.0%} of its image for the subject"
