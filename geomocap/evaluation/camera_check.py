@@ -20,7 +20,7 @@ from geomocap.model.rig_doubts import rig_doubts
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items
 from geomocap.silhouettes.background import model_from_frames, model_from_plate
-from geomocap.silhouettes.contradictions import Contradiction, Evidence, find_contradictions
+from geomocap.silhouettes.contradictions import Contradiction, OwnSilhouettes, find_contradictions
 from geomocap.silhouettes.silhouette_scene import SilhouetteScene
 from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
@@ -112,7 +112,7 @@ def check_cameras_of(
         def moments(camera: int, numbers: Sequence[int]) -> list[np.ndarray]:
             return [look.silhouette(names[camera], k, scenes[camera]) for k in numbers]
 
-        evidence = Evidence.of(Undistortion.of(small), masks, frames)
+        evidence = OwnSilhouettes.of(Undistortion.of(small), masks, frames)
         contradictions = find_contradictions(evidence, capture.n_frames, moments)
     contradicting = [c for found in contradictions for c in found.cameras if len(found.cameras) < max(3, len(names))]
     return CameraCheck(
@@ -177,10 +177,6 @@ class _Look:
             if any(map(capture.has_background, capture.cameras)):
                 warnings.append(f"background/{camera}.png: is missing; the background is estimated from the frames")
             if capture.n_recorded < FEWEST:
-                warnings.append(
-                    f"camera {camera}: {capture.n_recorded} frames without a background picture don't show what is "
-                    f"background; add background/{camera}.png"
-                )
                 return CameraLook(None, None, tuple(warnings))
             source = capture.sources[camera]
             chosen = np.unique(np.linspace(0, len(source) - 1, min(self.settings.samples, len(source))).round())

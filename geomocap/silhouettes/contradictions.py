@@ -85,7 +85,7 @@ REMEDIES = (
 
 
 @dataclass(frozen=True)
-class Evidence:
+class OwnSilhouettes:
     """Silhouettes that each camera has decided alone, in small images.
 
     Attributes
@@ -107,7 +107,7 @@ class Evidence:
     @classmethod
     def of(
         cls, undistortion: Undistortion, masks: Sequence[Sequence[np.ndarray]], frames: Sequence[int] | None = None
-    ) -> Evidence:
+    ) -> OwnSilhouettes:
         """Gather silhouettes of images that show something everywhere."""
         numbers = range(len(masks)) if frames is None else frames
         rows = tuple(tuple((m > 0).view(np.uint8) for m in row) for row in masks)
@@ -145,13 +145,13 @@ class Evidence:
         """Silhouettes of a camera, F arrays (H_c, W_c) uint8."""
         return [row[camera] for row in self.masks]
 
-    def replaced(self, camera: int, masks: Sequence[np.ndarray], seen: np.ndarray | None = None) -> Evidence:
+    def replaced(self, camera: int, masks: Sequence[np.ndarray], seen: np.ndarray | None = None) -> OwnSilhouettes:
         """Return this with other silhouettes of a camera."""
         rows = tuple((*r[:camera], m, *r[camera + 1 :]) for r, m in zip(self.masks, masks, strict=True))
         region = self.seen if seen is None else (*self.seen[:camera], seen, *self.seen[camera + 1 :])
         return replace(self, masks=rows, seen=region)
 
-    def remedied(self, camera: int, turn: Turn | None) -> Evidence:
+    def remedied(self, camera: int, turn: Turn | None) -> OwnSilhouettes:
         """Return this with a remedy applied to a camera."""
         own = self.of_camera(camera)
         if turn is None:
@@ -166,12 +166,12 @@ class Evidence:
         shrunk = abs(np.linalg.det(turn)) < 1  # what is beyond a smaller image is background
         return self.replaced(camera, [turned(m) for m in own], None if shrunk else turned(self.seen[camera]))
 
-    def swapped(self, a: int, b: int) -> Evidence:
+    def swapped(self, a: int, b: int) -> OwnSilhouettes:
         """Return this with the silhouettes of two cameras, whose images have one size, changed for each other."""
         first, second = self.of_camera(a), self.of_camera(b)
         return self.replaced(a, second).replaced(b, first)
 
-    def part(self, rows: Sequence[int]) -> Evidence:
+    def part(self, rows: Sequence[int]) -> OwnSilhouettes:
         """Return some frames of this."""
         return replace(self, masks=tuple(self.masks[n] for n in rows), frames=tuple(self.frames[n] for n in rows))
 
@@ -184,7 +184,7 @@ class _Attempt:
     what: str
     before: np.ndarray
     after: np.ndarray
-    evidence: Evidence
+    evidence: OwnSilhouettes
 
     @property
     def helps(self) -> bool:
@@ -196,13 +196,13 @@ class _Attempt:
 
 
 def find_contradictions(
-    evidence: Evidence, count: int = 0, moments: Moments | None = None
+    evidence: OwnSilhouettes, count: int = 0, moments: Moments | None = None
 ) -> tuple[Contradiction, ...]:
     """Find the cameras that contradict the others, and what is wrong with them.
 
     Parameters
     ----------
-    evidence : Evidence
+    evidence : OwnSilhouettes
         Of some frames.
     count : int
         Frames of the recording.
@@ -227,21 +227,21 @@ def find_contradictions(
     return tuple(found)
 
 
-def _empty(evidence: Evidence) -> np.ndarray:
+def _empty(evidence: OwnSilhouettes) -> np.ndarray:
     """Cameras without silhouette in all frames, (C,) bool; none if that are most of them."""
-    empty = np.array([v.blind() for v in evidence.views()]).all(axis=0)
+    empty: np.ndarray = np.asarray(np.array([v.blind() for v in evidence.views()]).all(axis=0))
     return empty & (empty.sum() < len(empty) / 2)
 
 
 def _worst(
-    evidence: Evidence, heeded: np.ndarray, count: int, moments: Moments | None
-) -> tuple[Contradiction, Evidence, np.ndarray] | None:
+    evidence: OwnSilhouettes, heeded: np.ndarray, count: int, moments: Moments | None
+) -> tuple[Contradiction, OwnSilhouettes, np.ndarray] | None:
     """Find the camera that contradicts the others most: what is wrong, and evidence and cameras without that."""
     before = evidence.denied(heeded)
     names, total, n = evidence.undistortion.names, mean(before), int(heeded.sum())
     if total < CLEAR:
         return None
-    others = {k: heeded & (np.arange(len(heeded)) != k) for k in np.flatnonzero(heeded)} if n > 2 else {}
+    others = {k: heeded & (np.arange(len(heeded)) != k) for k in np.flatnonzero(heeded).tolist()} if n > 2 else {}
     without = {k: evidence.denied(some) for k, some in others.items()}
     left = {k: mean(d) for k, d in without.items()}
     ranked = sorted(left, key=lambda k: left[k])
@@ -279,21 +279,21 @@ def mean(values: np.ndarray, nothing: float = 0.0) -> float:
     return float(known.mean()) if known.size else nothing
 
 
-def _attempts(evidence: Evidence, heeded: np.ndarray, camera: int, before: np.ndarray) -> Iterator[_Attempt]:
+def _attempts(evidence: OwnSilhouettes, heeded: np.ndarray, camera: int, before: np.ndarray) -> Iterator[_Attempt]:
     """Try what can be done to a camera's images; what has no outline can only be inverted."""
     full, enough = evidence.surrounding(camera), float(np.nansum(before)) / 2
     for remedy in REMEDIES:
         if not full or remedy.turn is None:
             changed = evidence.remedied(camera, remedy.turn)
             yield _Attempt((camera,), remedy.what, before, changed.denied(heeded, enough), changed)
-    for other in np.flatnonzero(heeded) if not full else ():
+    for other in np.flatnonzero(heeded).tolist() if not full else ():
         if other != camera and evidence.seen[other].shape == evidence.seen[camera].shape:
-            changed, pair = evidence.swapped(camera, other), tuple(sorted((camera, int(other))))
+            changed, pair = evidence.swapped(camera, other), (min(camera, other), max(camera, other))
             yield _Attempt(pair, "they seem to be mixed up", before, changed.denied(heeded, enough), changed)
 
 
 def _lags(
-    evidence: Evidence, heeded: np.ndarray, camera: int, before: np.ndarray, count: int, moments: Moments
+    evidence: OwnSilhouettes, heeded: np.ndarray, camera: int, before: np.ndarray, count: int, moments: Moments
 ) -> list[_Attempt]:
     """Try other moments of a camera: wide apart first, then about the best of them."""
     tried: dict[int, tuple[float, _Attempt]] = {}
