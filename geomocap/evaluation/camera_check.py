@@ -185,7 +185,7 @@ class _Look:
             )
         scene = SilhouetteScene.unlearnt([model], None, self.settings)
         scene = scene.learnt([scene.count([image]) for image in images])
-        masks = tuple(scene.silhouettes([image])[0].view(np.uint8) for image in images)
+        masks = tuple(scene.alone([image])[0] for image in images)
         always = float(np.min(masks, axis=0).mean())
         if always > 0.5 and capture.has_background(camera):
             warnings.append(
@@ -199,7 +199,7 @@ class _Look:
         """Silhouette of a frame in a small image, (H, W) uint8."""
         if scene is None:
             return (self._shrink(camera, self.capture.mask(camera, frame)) > 127).view(np.uint8)
-        return scene.silhouettes([self.small(camera, frame)])[0].view(np.uint8)
+        return scene.alone([self.small(camera, frame)])[0]
 
     def small(self, camera: str, frame: int) -> np.ndarray:
         """Read a picture and shrink it."""
