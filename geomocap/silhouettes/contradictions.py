@@ -5,7 +5,8 @@ contradiction of a recording. A camera is at fault if that falls to less than ha
 its images are turned, mirrored, enlarged, inverted, changed for another camera's or for those of another moment. Then
 that is what is wrong with it. If no such remedy helps, it is at fault if without it the contradiction falls to less
 than half, and more than half of what it sees, or of what the others see, is denied, or a tenth of both: a silhouette
-with mistakes is denied where it has too much, or denies where it lacks something; one in the wrong place does both.
+with mistakes is denied where it has too much, or denies where it lacks something; one in the wrong place does both. A third
+of what it sees is enough if as much of that stands still: then its background isn't what it was taken for.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from geomocap.carving.silhouette_views import PinholeViews, Undistortion
 from geomocap.silhouettes.ray_agreement import unexplained
 
 CLEAR = 0.01  # of the silhouettes: less contradiction than this comes from pixels
+STILL = 1 / 3  # of what a camera sees: half as much as the rest
 DISPLACED = 0.1  # of silhouettes: what is missed or added by mistake is denied on one side only, not on both
 MANY = 4  # cameras from which on one may be set aside to judge the others
 LAGS = (1, 3, 9, 27)  # frames by which a camera may be late or early
@@ -141,6 +143,11 @@ class OwnSilhouettes:
         shares = [np.concatenate([m[0], m[-1], m[1:-1, 0], m[1:-1, -1]]).mean() for m in self.of_camera(camera)]
         return float(np.median(shares)) > 0.5
 
+    def still(self, camera: int) -> float:
+        """Part of what a camera takes for the subject that it does so in all frames."""
+        masks = np.array(self.of_camera(camera))
+        return float(masks.min(axis=0).sum() * len(masks) / max(int(masks.sum()), 1))
+
     def of_camera(self, camera: int) -> list[np.ndarray]:
         """Silhouettes of a camera, F arrays (H_c, W_c) uint8."""
         return [row[camera] for row in self.masks]
@@ -257,8 +264,11 @@ def _worst(
         return Contradiction(wrong, best.what, mean(best.before), mean(best.after)), best.evidence, rest
     for k in at_fault[:1]:
         own, theirs = mean(before[:, k]), mean((before - without[k])[:, others[k]])
-        if max(own, theirs) > 0.5 or min(own, theirs) > DISPLACED:
+        still = own > STILL and evidence.still(k) > STILL
+        if max(own, theirs) > 0.5 or min(own, theirs) > DISPLACED or still:
             what = f"the others deny {own:.0%} of what it sees, and it denies {theirs:.0%} of what they see"
+            if still:
+                what += ", and much of that stands still; is its background right?"
             if evidence.surrounding(k):
                 what = f"it takes {np.mean(evidence.of_camera(k)):.0%} of its image for the subject"
             return Contradiction((names[k],), what, total, left[k]), evidence, others[k]
@@ -313,7 +323,7 @@ def _lags(
         attempt(-lag)
     for _ in range(2):
         best = min(tried, key=lambda lag: tried[lag][0], default=0)
-        for step in (abs(best) // 2, abs(best) // 4):
+        for step in (max(1, abs(best) // 2), max(1, abs(best) // 4)):
             attempt(best - step)
             attempt(best + step)
     return [tried[lag][1] for lag in tried]
