@@ -26,6 +26,7 @@ from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 LONGEST = 160  # longer side of the pictures that are looked at, pixels
 FRAMES = 6  # spread over the recording
+SAMPLES = 16  # frames that show the background of a camera without a picture of it
 FEWEST = 10  # frames without a background picture don't show what moves
 FLAT = 2  # grey levels between the darkest and the brightest pixel of a picture that shows nothing
 
@@ -179,7 +180,9 @@ class _Look:
             if capture.n_recorded < FEWEST:
                 return CameraLook(None, None, tuple(warnings))
             source = capture.sources[camera]
-            chosen = np.unique(np.linspace(0, len(source) - 1, min(self.settings.samples, len(source))).round())
+            chosen = np.unique(
+                np.linspace(0, len(source) - 1, min(self.settings.samples, SAMPLES, len(source))).round()
+            )
             model = model_from_frames(
                 [self._shrink(camera, source.read(int(k))) for k in chosen], self.settings, camera
             )

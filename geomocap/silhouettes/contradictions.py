@@ -5,8 +5,8 @@ contradiction of a recording. A camera is at fault if that falls to less than ha
 its images are turned, mirrored, enlarged, inverted, changed for another camera's or for those of another moment. Then
 that is what is wrong with it. If no such remedy helps, it is at fault if without it the contradiction falls to less
 than half, and more than half of what it sees, or of what the others see, is denied, or a tenth of both: a silhouette
-with mistakes is denied where it has too much, or denies where it lacks something; one in the wrong place does both. A third
-of what it sees is enough if as much of that stands still: then its background isn't what it was taken for.
+with mistakes is denied where it has too much, or denies where it lacks something; one in the wrong place does both.
+A third of what it sees is enough if as much of that stands still: then its background is wrong.
 """
 
 from __future__ import annotations
