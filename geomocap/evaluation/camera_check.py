@@ -27,7 +27,7 @@ from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 LONGEST = 160  # longer side of the pictures that are looked at, pixels
 FRAMES = 6  # spread over the recording
 SAMPLES = 16  # frames that show the background of a camera without a picture of it
-FEWEST = 10  # frames without a background picture don't show what moves
+BACKGROUND_FRAMES = 10  # frames without a background picture don't show what moves
 FLAT = 2  # grey levels between the darkest and the brightest pixel of a picture that shows nothing
 
 
@@ -177,7 +177,7 @@ class _Look:
         else:
             if any(map(capture.has_background, capture.cameras)):
                 warnings.append(f"background/{camera}.png: is missing; the background is estimated from the frames")
-            if capture.n_recorded < FEWEST:
+            if capture.n_recorded < BACKGROUND_FRAMES:
                 return CameraLook(None, None, tuple(warnings))
             source = capture.sources[camera]
             chosen = np.unique(

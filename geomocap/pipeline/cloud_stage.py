@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numba
@@ -15,6 +16,7 @@ from geomocap.dense.dense_settings import CloudSettings
 from geomocap.dense.match_groups import MatchGroups, match_groups
 from geomocap.dense.matching_images import undistorted_color
 from geomocap.errors import CaptureError, GeometryError, GeomocapError
+from geomocap.evaluation.camera_check import BACKGROUND_FRAMES
 from geomocap.files.capture import Capture
 from geomocap.files.results import read_silhouette, read_voxels, write_cloud_record, write_points
 from geomocap.files.run import Run, stage_key
@@ -22,8 +24,6 @@ from geomocap.pipeline.job import Job
 from geomocap.pipeline.silhouette_stage import silhouettes
 from geomocap.pipeline.voxel_stage import voxels
 from geomocap.scheduling import map_items
-
-BACKGROUND_FRAMES = 10  # fewer frames without a background picture don't show what moves
 
 Bounds = Literal["hull", "silhouettes", "none"]
 
@@ -50,14 +50,22 @@ def clouds(job: Job) -> str:
     )
 
     def work() -> int:
-        missing = [k for k in range(capture.n_frames) if not job.run.frame_file("cloud", k).exists()]
+        sound = job.run.sound("cloud")
+        files = {k: cloud_files(job.run, k) for k in range(capture.n_frames)}
+        missing = [k for k, of_frame in files.items() if not sound.issuperset(of_frame)]
         task = _Measure(capture, job.run, settings, groups, bounds, len(missing) == 1)
-        for _ in map_items(task, missing, job.executor, "cloud", job.progress, 4):
-            pass
+        for k, _ in zip(missing, map_items(task, missing, job.executor, "cloud", job.progress, 4), strict=True):
+            job.run.note("cloud", files[k])
         return len(missing)
 
     job.write_record("cloud")
     return job.stage("cloud", key, ["cloud"], work)
+
+
+def cloud_files(run: Run, frame: int) -> list[Path]:
+    """Files of a frame: the points, and how they came about."""
+    points = run.frame_file("cloud", frame)
+    return [points, points.with_suffix(".json")]
 
 
 def cloud_settings(settings: CloudSettings, capture: Capture) -> CloudSettings:
