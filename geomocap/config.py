@@ -10,6 +10,7 @@ from pydantic import Field
 from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.carving.carving_settings import CarvingSettings
 from geomocap.dense.dense_settings import CloudSettings
+from geomocap.evaluation.camera_settings import CameraSettings
 from geomocap.export.export_settings import ExportSettings
 from geomocap.files.scan_settings import ScanSettings
 from geomocap.nodes.node_settings import NodeTrackingSettings
@@ -26,6 +27,7 @@ from geomocap.trajectories.trajectory_settings import FilterSettings, SmoothingS
 class Config(Settings):
     """Settings of all stages."""
 
+    cameras: CameraSettings = Field(CameraSettings(), description="check of the cameras")
     silhouettes: SilhouetteSettings = Field(SilhouetteSettings(), description="silhouettes")
     carving: CarvingSettings = Field(CarvingSettings(), description="space carving")
     cloud: CloudSettings = Field(CloudSettings(), description="surface measurement by least squares matching")

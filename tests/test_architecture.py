@@ -43,7 +43,7 @@ ROOMS: dict[str, set[str]] = {
     "subject": VALUES | {"bodies", "files", "skeleton", "trajectories"},
     # out of the house
     "export": VALUES | {"files", "skeleton", "subject", "version"},
-    "evaluation": VALUES | {"carving", "files", "export", "skeleton", "subject"},
+    "evaluation": VALUES | {"carving", "files", "silhouettes", "export", "skeleton", "subject"},
     "inspection": VALUES | {"files", "export", "evaluation", "subject"},
 }
 ROOMS["config"] = set(ROOMS)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import trimesh
+from trimesh.visual import ColorVisuals
 
 from geomocap.errors import GeometryError, RunError
 from geomocap.files.frame_files import read_points
@@ -85,8 +86,9 @@ def _triangles(found: trimesh.Trimesh, path: Path) -> Mesh:
         raise GeometryError(f"{path}: its triangles have no area; is it whole?")
     vertices, faces = np.where(np.isfinite(vertices), vertices, vertices[kept[0]]), faces[good]
     colors = np.full((len(faces), 3), (0.62, 0.66, 0.72))
-    if found.visual.kind == "vertex":
-        colors = np.asarray(found.visual.vertex_colors)[faces][..., :3].mean(axis=1) / 255
+    visual = found.visual
+    if isinstance(visual, ColorVisuals) and visual.kind == "vertex":
+        colors = np.asarray(visual.vertex_colors)[faces][..., :3].mean(axis=1) / 255
     return Mesh(vertices, faces, vertex_normals(vertices, faces), colors)
 
 

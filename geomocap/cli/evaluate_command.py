@@ -20,6 +20,7 @@ from geomocap.evaluation.result import Evaluation
 from geomocap.evaluation.result_check import check_run
 from geomocap.evaluation.run_evaluation import evaluate as evaluate_run
 from geomocap.files.atomic import write_text
+from geomocap.files.camera_file import read_camera_doubts
 from geomocap.files.check_file import read_self_check
 from geomocap.files.result_schemas import skeleton_gaps
 from geomocap.files.results import SKELETON, read_skeleton, read_warnings
@@ -92,7 +93,7 @@ def _without_truth(folder: Path, json_file: Path | None) -> None:
         raise RunError(
             f"{folder}: has no silhouettes or no model to compare; name a truth, or make them by `geomocap run`"
         )
-    verdict, reasons = found.verdict(tuple(read_warnings(run)))
+    verdict, reasons = found.verdict((*read_camera_doubts(run).warnings, *read_warnings(run)))
     for name, value in found.figures.items():
         console.print(f"{name}: {round(value, 4)}", markup=False)
     console.print(f"verdict: {verdict}" + "".join(f"\n  {reason}" for reason in reasons), markup=False)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from geomocap.cli.execution import executor_for
 from geomocap.cli.progress_bars import progress_bars
-from geomocap.cli.reports import tell_note, working
+from geomocap.cli.reports import agreeing_job, tell_note, working
 from geomocap.config import Config
 from geomocap.errors import GeomocapError, RunError
 from geomocap.files.capture import Capture
@@ -40,7 +40,8 @@ def capture_job(
         for note in opened.rig.notes:
             tell_note(note)
     with working(run, wait), executor_for(workers, scheduler) as executor, progress_bars() as progress:
-        yield Job(Run(run), config, executor, progress, capture=opened, fps=opened.fps, model=model, tell=tell_note)
+        job = Job(Run(run), config, executor, progress, capture=opened, fps=opened.fps, model=model, tell=tell_note)
+        yield agreeing_job(job)
 
 
 @contextmanager

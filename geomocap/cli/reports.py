@@ -11,11 +11,13 @@ from pathlib import Path
 from geomocap.cli.console import console
 from geomocap.errors import GeomocapError, RunError
 from geomocap.files.atomic import fingerprint
+from geomocap.files.camera_file import read_camera_doubts
 from geomocap.files.capture import Capture
 from geomocap.files.results import read_cloud_record, read_warnings
 from geomocap.files.run import Run, stage_key
 from geomocap.files.run_lock import working_in
 from geomocap.files.stage_records import listed_faults
+from geomocap.pipeline.camera_stage import agreeing, without_left_out
 from geomocap.pipeline.cloud_stage import measure_again
 from geomocap.pipeline.job import Job
 from geomocap.progress import Progress, silent
@@ -44,6 +46,14 @@ def review_job(job: Job, made_from: str) -> None:
 def review_run(run: Run, capture: Capture | None, progress: Progress = silent) -> list[Path]:
     """Make pictures and report of a run, with a frame's surface measured again where it was measured."""
     return review(run, capture, measured=partial(measure_again, run, capture), progress=progress)
+
+
+def agreeing_job(job: Job) -> Job:
+    """Check the cameras of a job, print what is doubtful, and return it without those that are to be left out."""
+    job, warnings = agreeing(job)
+    for warning in warnings:
+        console.print(f"warning: {warning}", markup=False)
+    return job
 
 
 @contextmanager
@@ -84,7 +94,7 @@ def capture_of(run: Run) -> Capture | None:
     if source.get("kind") != "capture":
         return None
     try:
-        return Capture.open(Path(source["path"]))
+        return without_left_out(Capture.open(Path(source["path"])), read_camera_doubts(run))
     except GeomocapError as error:
         tell_note(f"the capture can't be shown ({error})")
         return None

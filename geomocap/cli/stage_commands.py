@@ -19,7 +19,7 @@ Fps = Annotated[float, typer.Option("--fps", min=LEAST_FPS, max=MOST_FPS, help="
 BODIES = ("segmentation", "skeleton", "nodes", "motion_bodies", "motion_skeleton", "refinement", "following")
 
 
-@with_settings("silhouettes")
+@with_settings("cameras", "silhouettes")
 def silhouettes(
     capture: CaptureFolder,
     run: RunFolder,
@@ -36,7 +36,7 @@ def silhouettes(
         pipeline.silhouettes(job)
 
 
-@with_settings("silhouettes", "carving")
+@with_settings("cameras", "silhouettes", "carving")
 def voxels(
     capture: CaptureFolder,
     run: RunFolder,
@@ -53,7 +53,7 @@ def voxels(
         pipeline.voxels(job)
 
 
-@with_settings("silhouettes", "carving", "cloud")
+@with_settings("cameras", "silhouettes", "carving", "cloud")
 def cloud(
     capture: CaptureFolder,
     run: RunFolder,
@@ -72,7 +72,7 @@ def cloud(
     tell_clouds(job.run)
 
 
-@with_settings("silhouettes", "carving", "tracking", "filters", "smoothing")
+@with_settings("cameras", "silhouettes", "carving", "tracking", "filters", "smoothing")
 def track(
     capture: CaptureFolder,
     run: RunFolder,
@@ -115,7 +115,7 @@ def segment(
     tell_results(run)
 
 
-@with_settings("silhouettes", "carving", "cloud", "tracking", "filters", "smoothing", *BODIES, "export")
+@with_settings("cameras", "silhouettes", "carving", "cloud", "tracking", "filters", "smoothing", *BODIES, "export")
 def run(
     capture: CaptureFolder,
     run: RunFolder,

@@ -12,11 +12,13 @@ bar/<camera>/000000.png          optional reference-bar recording
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, Protocol
 
+import cv2
 import numpy as np
 import tomli_w
 from pydantic import Field, ValidationError, field_validator
@@ -91,6 +93,10 @@ class FrameSource(Protocol):
     def read(self, frame: int) -> np.ndarray:
         """Return frame `frame` as (H, W, 3) uint8, RGB."""
         ...
+
+
+MOST_LABELS = 16  # values of a picture of labels
+LABELLED = 0.01  # of what isn't background, that has other labels than the subject's
 
 
 @dataclass(frozen=True)
@@ -225,6 +231,11 @@ class Capture:
         file = self.mask_file(camera, frame)
         values = read_image(file, gray=True)
         self.check_mask_size(camera, frame, (values.shape[1], values.shape[0]))
+        if labels := labels_of(values):
+            raise CaptureError(
+                f"{file}: holds areas of the values {', '.join(map(str, labels))}; expected 0 for background and 255 "
+                "for the subject: write it with these"
+            )
         mask = np.where(values > 127, 255, 0).astype(np.uint8)
         if values.any() and not mask.any():
             raise CaptureError(
@@ -275,9 +286,31 @@ class Capture:
                 )
         return rig
 
+    def without(self, cameras: Collection[str]) -> Capture:
+        """Return the capture without some of its cameras."""
+        kept = tuple(c for c in self.cameras if c not in cameras)
+        template = self.info.template_camera if self.info.template_camera in kept else None
+        info = self.info.model_copy(update={"template_camera": template})
+        return Capture(self.path, info, kept, {c: self.sources[c] for c in kept})
+
     def fingerprint(self, *parts: str) -> str:
         """Digest of the names, sizes and times of the files of these parts ("images", "masks", "sparse" …)."""
         return fingerprint([self.path / "capture.toml", *(self.path / p for p in parts)])
+
+
+def labels_of(values: np.ndarray) -> list[int]:
+    """Return the values of a picture (H, W) uint8 if they are labels that a limit would divide; else none.
+
+    Soft outlines have dark values, too, but no areas of them; what was compressed has areas, but of many values.
+    """
+    counts = np.bincount(values.ravel(), minlength=256)
+    present = np.flatnonzero(counts)
+    dark = counts[1:128].any() and counts[128:].any() and len(present) <= MOST_LABELS
+    if not dark:
+        return []
+    window = np.ones((3, 3), np.uint8)
+    flat = (cv2.erode(values, window) == cv2.dilate(values, window)) & (values > 0) & (values < 128)
+    return present.tolist() if np.count_nonzero(flat) > LABELLED * np.count_nonzero(values) else []
 
 
 def open_capture(path: str | Path) -> Capture:

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from geomocap.errors import GeomocapError
+from geomocap.evaluation.camera_check import check_cameras_of
 from geomocap.files.capture import Capture
 from geomocap.files.images import ImageFolder, image_size, size_text
 from geomocap.inspection.calibrations import describe_rig
@@ -45,6 +46,8 @@ def describe_capture(path: Path) -> Description:
     if (path / "bar").is_dir():
         told.fact("reference bar", f"recorded by {count(sum(p.is_dir() for p in (path / 'bar').iterdir()), 'camera')}")
     _judge_parts(capture, plates, told)
+    if not told.problems:
+        _judge_cameras(capture, told)
     return told
 
 
@@ -68,6 +71,15 @@ def _judge_parts(capture: Capture, plates: list[str], told: Description) -> None
     if capture.has_masks:
         for camera in capture.cameras:
             _judge_masks(capture, camera, told)
+
+
+def _judge_cameras(capture: Capture, told: Description) -> None:
+    """Ask whether the cameras fit together."""
+    try:
+        for warning in check_cameras_of(capture).warnings:
+            told.problem(warning)
+    except GeomocapError as error:
+        told.problem(error)
 
 
 def _judge_masks(capture: Capture, camera: str, told: Description) -> None:

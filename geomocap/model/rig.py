@@ -179,6 +179,16 @@ class Rig:
         in_camera /= np.linalg.norm(in_camera, axis=1, keepdims=True)
         return self.centers[camera], in_camera @ self.cam_from_world[camera, :, :3]
 
+    def reduced(self, longest: int) -> Rig:
+        """Return the rig with images reduced by whole factors, their longer sides to about `longest` pixels."""
+        cameras = []
+        for camera in self.cameras:
+            factor = reduction(camera.width, camera.height, longest)
+            small = pycolmap.Camera(camera.todict())
+            small.rescale(camera.width // factor, camera.height // factor)
+            cameras.append(small)
+        return Rig(self.names, tuple(cameras), np.array(self.cam_from_world))
+
     def undistorted(self) -> Rig:
         """Return the rig of pinhole cameras that see at least all that the real cameras see.
 
@@ -228,3 +238,8 @@ class Rig:
         source = self.cameras[camera].img_from_cam(np.column_stack([normalized, np.ones(len(normalized))]))
         source = np.nan_to_num(source.astype(np.float32) - np.float32(0.5), nan=-1e6)
         return source[:, 0].reshape(x.shape), source[:, 1].reshape(x.shape)
+
+
+def reduction(width: int, height: int, longest: int) -> int:
+    """Return by how much an image is reduced, so that its longer side is about `longest` pixels."""
+    return max(1, round(max(width, height) / longest))

@@ -16,6 +16,7 @@ from geomocap.dense.dense_settings import CloudSettings
 from geomocap.dense.match_groups import MatchGroups, match_groups
 from geomocap.dense.matching_images import undistorted_color
 from geomocap.errors import CaptureError, GeometryError, GeomocapError
+from geomocap.evaluation.camera_check import BACKGROUND_FRAMES
 from geomocap.files.capture import Capture
 from geomocap.files.results import read_silhouette, read_voxels, write_cloud_record, write_points
 from geomocap.files.run import Run, stage_key
@@ -23,8 +24,6 @@ from geomocap.pipeline.job import Job
 from geomocap.pipeline.silhouette_stage import silhouettes
 from geomocap.pipeline.voxel_stage import voxels
 from geomocap.scheduling import map_items
-
-BACKGROUND_FRAMES = 10  # fewer frames without a background picture don't show what moves
 
 Bounds = Literal["hull", "silhouettes", "none"]
 
@@ -39,7 +38,16 @@ def clouds(job: Job) -> str:
     bounds = bounds_of(capture, settings)
     before = {"hull": voxels, "silhouettes": silhouettes, "none": lambda _: ""}[bounds](job)
     pictures = capture.fingerprint("images", "videos", "sparse")
-    key = stage_key(__name__, "cloud", bounds, before, pictures, settings.model_dump(), capture.info.region_of_interest)
+    key = stage_key(
+        __name__,
+        "cloud",
+        bounds,
+        before,
+        pictures,
+        settings.model_dump(),
+        capture.info.region_of_interest,
+        capture.cameras,
+    )
 
     def work() -> int:
         sound = job.run.sound("cloud")

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomocap.errors import CaptureError
+from geomocap.evaluation.camera_check import BACKGROUND_FRAMES
 from geomocap.files.capture import Capture
 from geomocap.files.images import write_mask
 from geomocap.files.run import Run, stage_key
@@ -31,6 +32,7 @@ def silhouettes(job: Job) -> str:
         str(capture.path.resolve()),
         capture.fingerprint("images", "videos", "background", "masks", "sparse"),
         job.config.silhouettes.model_dump(),
+        capture.cameras,
     )
     job.write_record("silhouettes")
     return job.stage("silhouettes", key, ["silhouettes"], lambda: _make_silhouettes(job, capture))
@@ -42,6 +44,12 @@ def _make_silhouettes(job: Job, capture: Capture) -> int:
     missing = [k for k, of_frame in files.items() if not sound.issuperset(of_frame)]
     task: Callable[[int], None] = _Copy(capture, job.run)
     if missing and not capture.has_masks:
+        lacking = [c for c in capture.cameras if not capture.has_background(c)]
+        if lacking and capture.n_recorded < BACKGROUND_FRAMES:
+            job.tell(
+                f"{capture.n_recorded} frames without background pictures of {', '.join(lacking)} hardly show what the "
+                "background is; add background/<camera>.png"
+            )
         task = _Cut(capture, job.run, learn_scene(job, capture))
     for k, _ in zip(missing, map_items(task, missing, job.executor, "silhouettes", job.progress, 4), strict=True):
         job.run.note("silhouettes", files[k])

@@ -16,7 +16,7 @@ from geomocap.model.rig import Rig
 from geomocap.silhouettes.background import BackgroundModel, model_from_frames, model_from_plate
 from geomocap.silhouettes.joint_decision import CameraEvidence, decide, learn_from
 from geomocap.silhouettes.likelihood import Counts, Likelihood
-from geomocap.silhouettes.other_cameras import OtherCameras
+from geomocap.silhouettes.other_cameras import OtherCameras, large_pieces
 from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 LEARNING_FRAMES = 6  # spread over the recording
@@ -83,6 +83,11 @@ class SilhouetteScene:
             return masks
         given = [m.astype(np.uint8) * np.uint8(255) for m in masks]
         return tuple(m > 0 for m in fill_false_holes(self.rig, self.undistortion.views(given), given))
+
+    def alone(self, images: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+        """Say what each camera takes for the subject by itself, C arrays (H, W) uint8: large pieces, as they are."""
+        voted = decide(self._evidence(images), self.likelihood, None, self.settings).voted
+        return tuple(large_pieces(odds > 0) for odds in voted)
 
     def _evidence(self, images: Sequence[np.ndarray]) -> list[CameraEvidence]:
         """Compare the images of a frame with the backgrounds."""

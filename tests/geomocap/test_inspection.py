@@ -36,7 +36,8 @@ def capture(tmp_path):
     for name in "abc":
         (folder / "images" / name).mkdir(parents=True)
         for k in range(3):
-            imwrite(str(folder / "images" / name / f"{k:06d}.png"), np.zeros((48, 64, 3), np.uint8))
+            picture = np.broadcast_to(np.arange(64, dtype=np.uint8)[:, None], (48, 64, 3))
+            imwrite(str(folder / "images" / name / f"{k:06d}.png"), picture)
     (folder / "capture.toml").write_text('name = "walk"\nfps = 15.0\n')
     return folder
 
