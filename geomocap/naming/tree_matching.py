@@ -1,0 +1,187 @@
+"""Which joint of a template a found joint is: the likeliest assignment under which both trees are cut alike.
+
+A found joint that the template has no counterpart for cuts one of its parts in two; a joint of the template that was not
+found leaves two of its parts in one body. So bodies needn't be parts one to one. What must hold is the order: of two
+joints one lies beyond the other, or each apart from the other, in both trees alike. Under that condition the sum of the
+joints' log likelihood ratios (template's joint against a joint of anything) is greatest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from geomocap.naming.best_assignment import heaviest_choices
+from geomocap.naming.mean_posture import MeanPosture
+from geomocap.naming.name_templates import NameTemplate
+from geomocap.naming.tree_features import JointFeatures, PosedTree, joint_features
+
+HEADINGS = 16  # directions in which a subject may face, of which the best is taken
+PLACE = 0.05  # how far subjects differ from a template, in shares of its longest way; standard deviation
+SURFACE, REACH = 0.5, 0.25  # the same of logarithms
+OUTLIERS = 0.1  # share of features that a template says nothing about
+DEPENDENT = 0.5  # features of a joint overlap: their weight together
+SURE = 5.0  # log odds beyond which nobody asks
+TURNED = 4.0  # log odds of a motion that shows the heading clearly
+
+
+@dataclass(frozen=True)
+class TreeMatch:
+    """A found tree matched to a template.
+
+    Attributes
+    ----------
+    template : NameTemplate
+    joints : (J,) int
+        Part of the template whose joint each found joint is; -1: none.
+    beyond : (J, B) bool
+        Bodies beyond each joint.
+    turn : (3, 3) float
+        Template's axes from the posture's.
+    score : float
+        Log likelihood ratio of the tree under the template.
+    joint_odds : (J,) float
+        Score lost without this joint's part.
+    side_odds : float
+        Score lost with left and right exchanged.
+    """
+
+    template: NameTemplate
+    joints: np.ndarray
+    beyond: np.ndarray
+    turn: np.ndarray
+    score: float
+    joint_odds: np.ndarray
+    side_odds: float
+
+
+@dataclass(frozen=True)
+class _Model:
+    """A template's features and how far subjects stray from them."""
+
+    template: NameTemplate
+    features: JointFeatures
+    place: np.ndarray  # (K - 1,) standard deviation
+    center: np.ndarray
+
+    @property
+    def nesting(self) -> np.ndarray:
+        return self.features.nesting
+
+
+def match_tree(posture: MeanPosture, template: NameTemplate) -> TreeMatch:
+    """Match the joints of a posture to a template.
+
+    Parameters
+    ----------
+    posture : MeanPosture
+    template : NameTemplate
+    """
+    model = _template_model(template)
+    found = joint_features(posture.tree, both_ways=True)
+    tries = []
+    for turn in _turns(template):
+        gains = _gains(found, model, turn)
+        cue = TURNED * float(posture.heading @ turn[0, :2]) if template.upright else 0.0
+        tries.append((float(np.maximum(_best_by_joint(found, gains), 0).sum()) + cue, cue, turn, gains))
+    tries.sort(key=lambda t: -t[0])
+    best: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
+    for bound, cue, turn, gains in tries:
+        least = -np.inf if best is None else best[0]
+        chosen = _assign(found, model, gains, least - cue) if bound > least else None
+        if chosen is not None:
+            best = cue + _sum(gains, chosen), chosen, turn, gains
+    assert best is not None
+    score, chosen, turn, gains = best
+    count = len(posture.tree.joints)
+    parts, beyond = np.full(count, -1), found.beyond[:count].copy()
+    odds = np.zeros(count)
+    total = _sum(gains, chosen)
+    for v in np.flatnonzero(chosen >= 0).tolist():
+        j = found.joint[v]
+        parts[j] = chosen[v] + 1
+        beyond[j] = found.beyond[v]
+        without = gains.copy()
+        without[found.joint == j, chosen[v]] = -np.inf
+        other = _assign(found, model, without, total - SURE)
+        odds[j] = SURE if other is None else total - _sum(without, other)
+    exchanged = np.where(chosen >= 0, template.mirrored[np.maximum(chosen, 0) + 1] - 1, -1)
+    mirrored = max(
+        cue + _sum(gains, exchanged) for _, cue, _, gains in tries
+    )
+    return TreeMatch(template, parts, beyond, turn, score, odds, score - mirrored)
+
+
+def _turns(template: NameTemplate) -> Iterator[np.ndarray]:
+    """Directions in which a subject may lie: about the vertical, or any."""
+    if template.upright:
+        angles = 2 * np.pi * np.arange(HEADINGS) / HEADINGS
+        yield from Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    else:
+        cubes = Rotation.create_group("O").as_matrix()
+        yield from cubes
+        yield from Rotation.from_rotvec([np.pi / 4, 0.0, 0.0]).as_matrix() @ cubes
+
+
+def _template_model(template: NameTemplate) -> _Model:
+    """Return a template's features with their spread: what is farther out along a limb strays farther."""
+    joints, hierarchy = template.joint_places[1:], template.hierarchy
+    count = len(template.parts)
+    lengths = np.full((count, count - 1), np.nan)
+    for j, both in enumerate(hierarchy.joint_bodies.tolist()):
+        for part in both:
+            end = template.tips[part] if np.isfinite(template.tips[part]).all() else template.centers[part]
+            lengths[part, j] = np.linalg.norm(end - joints[j])
+    features = joint_features(
+        PosedTree(hierarchy, joints, template.centers, lengths, template.surfaces), both_ways=False
+    )
+    inside = features.beyond[:, 1:].T & ~np.eye(count - 1, dtype=bool)  # [k, a]: joint k lies beyond joint a
+    ways = np.linalg.norm(joints[:, None] - joints[None], axis=2) / features.diameter
+    mobility = template.mobility[1:]
+    place = np.sqrt(PLACE**2 + ((inside * ways * mobility) ** 2).sum(axis=1))
+    center = np.sqrt(PLACE**2 + (mobility * np.linalg.norm(features.center, axis=1)) ** 2)
+    return _Model(template, features, place, center)
+
+
+def _gains(found: JointFeatures, model: _Model, turn: np.ndarray) -> np.ndarray:
+    """Log likelihood ratios, (V, K - 1), of found joints as joints of a template turned some way."""
+    known = model.features
+    gains = _ratio(found.surface[:, None] - known.surface, SURFACE, np.log(100))
+    gains += _ratio(found.reach[:, None] - known.reach, REACH, np.log(20))
+    place = found.place @ turn.T
+    center = found.center @ turn.T
+    for axis in range(3):
+        gains += _ratio(place[:, None, axis] - known.place[:, axis], model.place, 1.0)
+        gains += _ratio(center[:, None, axis] - known.center[:, axis], model.center, 1.0)
+    return DEPENDENT * gains
+
+
+def _ratio(error: np.ndarray, spread: np.ndarray | float, width: float) -> np.ndarray:
+    """Log of a normal density with outliers against an even one over a width."""
+    normal = np.exp(-0.5 * (error / spread) ** 2) / (np.sqrt(2 * np.pi) * spread) * width
+    return np.log((1 - OUTLIERS) * normal + OUTLIERS)
+
+
+def _best_by_joint(found: JointFeatures, gains: np.ndarray) -> np.ndarray:
+    return gains.max(axis=1).reshape(2, -1).max(axis=0)
+
+
+def _sum(gains: np.ndarray, chosen: np.ndarray) -> float:
+    return float(gains[chosen >= 0, chosen[chosen >= 0]].sum())
+
+
+def _assign(found: JointFeatures, model: _Model, gains: np.ndarray, above: float = 0.0) -> np.ndarray | None:
+    """Joint of the template for each way to look at a found joint, (V,) int; -1: none. None: no sum is above."""
+    views, parts = np.nonzero(gains > 0)
+    chosen = np.full(len(gains), -1)
+    if not len(views):
+        return chosen if above < 0 else None
+    excluded = found.nesting[np.ix_(views, views)] != model.nesting[np.ix_(parts, parts)]
+    taken = heaviest_choices(gains[views, parts], found.joint[views], parts, excluded, above)
+    if taken is None:
+        return None
+    chosen[views[taken]] = parts[taken]
+    return chosen
