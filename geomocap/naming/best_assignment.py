@@ -8,7 +8,7 @@ MOST_NODES = 200_000  # of the search; the best found so far is returned then
 
 
 def heaviest_choices(
-    weights: np.ndarray, groups: np.ndarray, kinds: np.ndarray, excluded: np.ndarray, above: float = 0.0
+    weights: np.ndarray, groups: np.ndarray, kinds: np.ndarray, excluded: np.ndarray, above: float = -np.inf
 ) -> list[int] | None:
     """Choose at most one of each group and of each kind, none excluding another, with the greatest sum of weights.
 

@@ -22,7 +22,7 @@ from geomocap.naming.tree_features import JointFeatures, PosedTree, joint_featur
 HEADINGS = 16  # directions in which a subject may face, of which the best is taken
 PLACE = 0.05  # how far subjects differ from a template, in shares of its longest way; standard deviation
 SURFACE, REACH = 0.5, 0.25  # the same of logarithms
-OUTLIERS = 0.1  # share of features that a template says nothing about
+LATERAL = 0.5  # of that to the sides: mean postures are nearly symmetric
 DEPENDENT = 0.5  # features of a joint overlap: their weight together
 SURE = 5.0  # log odds beyond which nobody asks
 TURNED = 4.0  # log odds of a motion that shows the heading clearly
@@ -30,32 +30,24 @@ TURNED = 4.0  # log odds of a motion that shows the heading clearly
 
 @dataclass(frozen=True)
 class TreeMatch:
-    """A found tree matched to a template.
+    """One way to match a found tree to a template.
 
     Attributes
     ----------
-    template : NameTemplate
     joints : (J,) int
         Part of the template whose joint each found joint is; -1: none.
     beyond : (J, B) bool
         Bodies beyond each joint.
     turn : (3, 3) float
-        Template's axes from the posture's.
+        Template's axes, forward, left and up, from the posture's.
     score : float
-        Log likelihood ratio of the tree under the template.
-    joint_odds : (J,) float
-        Score lost without this joint's part.
-    side_odds : float
-        Score lost with left and right exchanged.
+        Log likelihood ratio of the tree under the template against no template.
     """
 
-    template: NameTemplate
     joints: np.ndarray
     beyond: np.ndarray
     turn: np.ndarray
     score: float
-    joint_odds: np.ndarray
-    side_odds: float
 
 
 @dataclass(frozen=True)
@@ -66,19 +58,30 @@ class _Model:
     features: JointFeatures
     place: np.ndarray  # (K - 1,) standard deviation
     center: np.ndarray
+    side: np.ndarray  # 1 left, -1 right, 0 middle
 
     @property
     def nesting(self) -> np.ndarray:
         return self.features.nesting
 
 
-def match_tree(posture: MeanPosture, template: NameTemplate) -> TreeMatch:
-    """Match the joints of a posture to a template.
+def match_tree(posture: MeanPosture, template: NameTemplate, least: float = -np.inf) -> list[TreeMatch]:
+    """Match the joints of a posture to a template: the likeliest way, and others that are not much less likely.
+
+    The others are the best ones with the subject facing another way, with left and right exchanged, and with one joint
+    each taken for something else.
 
     Parameters
     ----------
     posture : MeanPosture
     template : NameTemplate
+    least : float
+        Scores below are not looked for.
+
+    Returns
+    -------
+    list of TreeMatch
+        The best one first, none twice; none at all if the best is below the least.
     """
     model = _template_model(template)
     found = joint_features(posture.tree, both_ways=True)
@@ -86,33 +89,48 @@ def match_tree(posture: MeanPosture, template: NameTemplate) -> TreeMatch:
     for turn in _turns(template):
         gains = _gains(found, model, turn)
         cue = TURNED * float(posture.heading @ turn[0, :2]) if template.upright else 0.0
-        tries.append((float(np.maximum(_best_by_joint(found, gains), 0).sum()) + cue, cue, turn, gains))
-    tries.sort(key=lambda t: -t[0])
-    best: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
-    for bound, cue, turn, gains in tries:
-        least = -np.inf if best is None else best[0]
-        chosen = _assign(found, model, gains, least - cue) if bound > least else None
-        if chosen is not None:
-            best = cue + _sum(gains, chosen), chosen, turn, gains
-    assert best is not None
-    score, chosen, turn, gains = best
-    count = len(posture.tree.joints)
-    parts, beyond = np.full(count, -1), found.beyond[:count].copy()
-    odds = np.zeros(count)
-    total = _sum(gains, chosen)
+        tries.append((float(np.maximum(_best_by_joint(gains), 0).sum()) + cue, cue, turn, gains))
+    tries.sort(key=lambda one: -one[0])
+    ways: dict[bytes, TreeMatch] = {}
+
+    def keep(chosen: np.ndarray, cue: float, turn: np.ndarray, gains: np.ndarray) -> None:
+        score = cue + _sum(gains, chosen)
+        known = ways.get(chosen.tobytes())
+        if np.isfinite(score) and (known is None or known.score < score):
+            ways[chosen.tobytes()] = _match(found, chosen, turn, score)
+
+    best = -1, least + SURE
+    for i, (bound, cue, turn, gains) in enumerate(tries):
+        if bound > max(best[1] - SURE, least):
+            chosen = _assign(found, model, gains, max(best[1] - SURE, least) - cue)
+            if chosen is not None:
+                keep(chosen, cue, turn, gains)
+                score = cue + _sum(gains, chosen)
+                best = (i, score) if best[0] < 0 or score > best[1] else best
+    if best[0] < 0:
+        return []
+    _, cue, turn, gains = tries[best[0]]
+    chosen = _assign(found, model, gains)
     for v in np.flatnonzero(chosen >= 0).tolist():
-        j = found.joint[v]
-        parts[j] = chosen[v] + 1
-        beyond[j] = found.beyond[v]
-        without = gains.copy()
-        without[found.joint == j, chosen[v]] = -np.inf
-        other = _assign(found, model, without, total - SURE)
-        odds[j] = SURE if other is None else total - _sum(without, other)
+        part = int(chosen[v]) + 1
+        for barred in ([part], [part, int(template.mirrored[part])]):
+            without = gains.copy()
+            without[np.ix_(found.joint == found.joint[v], np.array(barred) - 1)] = -np.inf
+            other = _assign(found, model, without, best[1] - SURE - cue)
+            if other is not None:
+                keep(other, cue, turn, gains)
     exchanged = np.where(chosen >= 0, template.mirrored[np.maximum(chosen, 0) + 1] - 1, -1)
-    mirrored = max(
-        cue + _sum(gains, exchanged) for _, cue, _, gains in tries
-    )
-    return TreeMatch(template, parts, beyond, turn, score, odds, score - mirrored)
+    for _, cue, turn, gains in tries:
+        keep(exchanged, cue, turn, gains)
+    return sorted(ways.values(), key=lambda way: -way.score)
+
+
+def _match(found: JointFeatures, chosen: np.ndarray, turn: np.ndarray, score: float) -> TreeMatch:
+    count = len(chosen) // 2
+    parts, beyond = np.full(count, -1), found.beyond[:count].copy()
+    for v in np.flatnonzero(chosen >= 0).tolist():
+        parts[found.joint[v]], beyond[found.joint[v]] = chosen[v] + 1, found.beyond[v]
+    return TreeMatch(parts, beyond, turn, score)
 
 
 def _turns(template: NameTemplate) -> Iterator[np.ndarray]:
@@ -143,7 +161,8 @@ def _template_model(template: NameTemplate) -> _Model:
     mobility = template.mobility[1:]
     place = np.sqrt(PLACE**2 + ((inside * ways * mobility) ** 2).sum(axis=1))
     center = np.sqrt(PLACE**2 + (mobility * np.linalg.norm(features.center, axis=1)) ** 2)
-    return _Model(template, features, place, center)
+    side = np.array([{"left": 1, "right": -1, "": 0}[s] for s in template.sides[1:]])
+    return _Model(template, features, place, center, side)
 
 
 def _gains(found: JointFeatures, model: _Model, turn: np.ndarray) -> np.ndarray:
@@ -153,19 +172,22 @@ def _gains(found: JointFeatures, model: _Model, turn: np.ndarray) -> np.ndarray:
     gains += _ratio(found.reach[:, None] - known.reach, REACH, np.log(20))
     place = found.place @ turn.T
     center = found.center @ turn.T
-    for axis in range(3):
-        gains += _ratio(place[:, None, axis] - known.place[:, axis], model.place, 1.0)
-        gains += _ratio(center[:, None, axis] - known.center[:, axis], model.center, 1.0)
-    return DEPENDENT * gains
+    for axis, share in enumerate((1.0, LATERAL, 1.0)):
+        gains += _ratio(place[:, None, axis] - known.place[:, axis], share * model.place, 1.0)
+        gains += _ratio(center[:, None, axis] - known.center[:, axis], share * model.center, 1.0)
+    gains *= DEPENDENT
+    if model.template.upright:  # what hangs on a joint of the left lies to the left of the middle
+        lateral = (place + center)[:, 1, None]
+        gains[lateral * model.side < 0] = -np.inf
+    return gains
 
 
 def _ratio(error: np.ndarray, spread: np.ndarray | float, width: float) -> np.ndarray:
-    """Log of a normal density with outliers against an even one over a width."""
-    normal = np.exp(-0.5 * (error / spread) ** 2) / (np.sqrt(2 * np.pi) * spread) * width
-    return np.log((1 - OUTLIERS) * normal + OUTLIERS)
+    """Log of a normal density against an even one over a width."""
+    return np.log(width / (np.sqrt(2 * np.pi) * spread)) - 0.5 * (error / spread) ** 2
 
 
-def _best_by_joint(found: JointFeatures, gains: np.ndarray) -> np.ndarray:
+def _best_by_joint(gains: np.ndarray) -> np.ndarray:
     return gains.max(axis=1).reshape(2, -1).max(axis=0)
 
 
@@ -173,12 +195,10 @@ def _sum(gains: np.ndarray, chosen: np.ndarray) -> float:
     return float(gains[chosen >= 0, chosen[chosen >= 0]].sum())
 
 
-def _assign(found: JointFeatures, model: _Model, gains: np.ndarray, above: float = 0.0) -> np.ndarray | None:
+def _assign(found: JointFeatures, model: _Model, gains: np.ndarray, above: float = -np.inf) -> np.ndarray | None:
     """Joint of the template for each way to look at a found joint, (V,) int; -1: none. None: no sum is above."""
     views, parts = np.nonzero(gains > 0)
     chosen = np.full(len(gains), -1)
-    if not len(views):
-        return chosen if above < 0 else None
     excluded = found.nesting[np.ix_(views, views)] != model.nesting[np.ix_(parts, parts)]
     taken = heaviest_choices(gains[views, parts], found.joint[views], parts, excluded, above)
     if taken is None:
