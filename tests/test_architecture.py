@@ -41,7 +41,8 @@ ROOMS: dict[str, set[str]] = {
     "motion": VALUES | {"bodies", "nodes", "skeleton", "trajectories"},
     "subject": VALUES | {"bodies", "files", "skeleton", "trajectories"},
     # out of the house
-    "export": VALUES | {"files", "skeleton", "subject", "version"},
+    "naming": VALUES,
+    "export": VALUES | {"files", "naming", "skeleton", "subject", "version"},
     "evaluation": VALUES | {"carving", "files", "export", "skeleton", "subject"},
     "inspection": VALUES | {"files", "export", "evaluation"},
 }

@@ -12,7 +12,6 @@ from geomocap.cli.console import console
 from geomocap.cli.progress_bars import progress_bars
 from geomocap.cli.settings_options import with_settings
 from geomocap.config import Config
-from geomocap.export.names import Names
 from geomocap.export.run_export import Exported, export_run
 from geomocap.files.run import Run
 
@@ -29,10 +28,6 @@ def export(
     csv: Annotated[bool, typer.Option("--csv", help="CSV: world axes, m and degrees.")] = False,
     parquet: Annotated[bool, typer.Option("--parquet", help="Parquet, as CSV; needs the extra parquet.")] = False,
     with_skin: Annotated[bool, typer.Option("--skin", help="The same as --surface skin.")] = False,
-    names: Annotated[
-        Path | None,
-        typer.Option("--names", metavar="FILE.toml", help="Names: thigh_left = 3 …; RUN/names.toml if not given."),
-    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; RUN if not given.")
     ] = None,
@@ -50,9 +45,7 @@ def export(
     if with_skin:
         settings = settings.model_copy(update={"surface": "skin"})
     with progress_bars() as progress:
-        exported = export_run(
-            Run(run), formats, settings, names=Names.read(names) if names else None, folder=out, progress=progress
-        )
+        exported = export_run(Run(run), formats, settings, folder=out, progress=progress)
     report_exported(exported)
 
 
@@ -62,6 +55,10 @@ def report_exported(exported: Exported) -> None:
         console.print(f"{path}", markup=False)
     for reason in exported.skipped.values():
         console.print(f"not written: {reason}", markup=False)
+    if exported.found.template is not None:
+        found = exported.found
+        sides = "" if found.sides_known else ", left and right not told: sides are a and b"
+        console.print(f"named as {found.template.name}: {len(found.bodies)} bodies, {len(found.joints)} joints{sides}")
     console.print(f"largest deviation from skeleton.npz: {exported.deviation_mm:.3f} mm")
     if exported.moving_joints:
         count = len(exported.moving_joints)

@@ -12,6 +12,16 @@ from geomocap.settings import Settings
 class ExportSettings(Settings):
     """What motion files hold, and in which units."""
 
+    names: str = Field(
+        "auto",
+        description="names of bodies and joints: auto (from the template that fits clearly, else numbers), none, a "
+        "template (human, quadruped, bird, hand, or a TOML file), or a file of your own names; RUN/names.toml goes "
+        "before found ones",
+        json_schema_extra={"flag": "names"},
+    )
+    name_set: Literal["plain", "opensim", "mixamo", "humanik", "coco"] = Field(
+        "plain", description="whose words names are in", json_schema_extra={"flag": "name-set"}
+    )
     joints: Literal["auto", "fixed", "moving"] = Field(
         "auto",
         description="fixed: constant offsets between joints; moving: every joint shifts in every frame; auto: only "

@@ -19,15 +19,18 @@ from geomocap.export.markers import Markers, markers_from_run
 from geomocap.export.model_skin import skin_from_model
 from geomocap.export.motion_tree import MotionTree
 from geomocap.export.names import Names
+from geomocap.export.run_names import NAMES_FOUND, names_text, run_names
 from geomocap.export.skeleton_motion import UNKNOWN_RADIUS, motion_from_skeleton
 from geomocap.export.skin import skin_from_run
 from geomocap.export.skinned_mesh import SkinnedMesh
 from geomocap.export.tables import motion_table, write_csv, write_parquet
 from geomocap.export.trc import write_trc
 from geomocap.export.usd import write_usd
+from geomocap.files.atomic import write_text
 from geomocap.files.results import ELLIPSOIDS, KEYPOINTS, read_ellipsoids, read_keypoint_paths, read_skeleton
 from geomocap.files.run import Run
 from geomocap.model.skeleton import Skeleton
+from geomocap.naming.found_names import FoundNames
 from geomocap.progress import Progress, silent
 from geomocap.settings import check_settings
 from geomocap.subject.subject_model import MODEL_FILE, read_model
@@ -56,12 +59,15 @@ class Exported:
         Largest distance of the files' joints from those of `skeleton.npz`.
     moving_joints : tuple of str
         Nodes that shift against their parents, because their joints are not fixed in the bodies.
+    found : FoundNames
+        Names from a template.
     """
 
     files: dict[str, Path]
     skipped: dict[str, str] = field(default_factory=dict)
     deviation_mm: float = 0.0
     moving_joints: tuple[str, ...] = ()
+    found: FoundNames = field(default_factory=FoundNames)
 
 
 def export_run(
@@ -84,7 +90,7 @@ def export_run(
     settings : ExportSettings, optional
         By default those of the run.
     names : Names, optional
-        The user's names; by default those of `RUN/names.toml` if it is there.
+        The user's names; by default those that `settings.names` asks for.
     folder : Path, optional
         Where to write; by default the run.
     progress : Progress
@@ -103,9 +109,8 @@ def export_run(
     if unknown:
         raise MotionError(f"{unknown[0]}: no motion format; expected one of {', '.join(FILES)}")
     skeleton = read_skeleton(run)
-    if names is None and (run.path / "names.toml").is_file():
-        names = Names.read(run.path / "names.toml")
     up = run_up(run)
+    names, found = (names, FoundNames()) if names is not None else run_names(run, skeleton, up, settings)
     motion = motion_from_skeleton(skeleton, up=up, names=names, joints=settings.joints, radius=mean_radius(run))
     markers = run_markers(run, skeleton, names, up, ellipsoids=settings.ellipsoids)
     mesh = surface_of_run(run, motion, settings)
@@ -122,8 +127,10 @@ def export_run(
                 raise
             skipped[name] = str(error)
         progress("export", k + 1, len(chosen))
+    if found.template is not None:
+        write_text((folder or run.path) / NAMES_FOUND, names_text(found))
     shifting = tuple(n for n, m, j in zip(motion.names, motion.moving, motion.joints, strict=True) if m and j >= 0)
-    return Exported(files, skipped, motion.largest_deviation_mm(skeleton.joint_positions), shifting)
+    return Exported(files, skipped, motion.largest_deviation_mm(skeleton.joint_positions), shifting, found)
 
 
 def run_settings(run: Run) -> ExportSettings:

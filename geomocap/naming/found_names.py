@@ -15,7 +15,7 @@ import numpy as np
 from geomocap.model.skeleton import Skeleton
 from geomocap.naming.mean_posture import BodySurface, MeanPosture, mean_posture
 from geomocap.naming.name_templates import SIDES, NameTemplate, read_template
-from geomocap.naming.tree_matching import SURE, TreeMatch, match_tree
+from geomocap.naming.tree_matching import SURE, TreeMatch, decoy_score, match_tree
 
 LIKELY = 0.7  # a name is given
 CERTAIN = 0.9  # left and right are told
@@ -74,7 +74,8 @@ def find_names(
     surface : BodySurface, optional
         In the first frame; without it names are less sure.
     templates : sequence of NameTemplate, optional
-        By default those of whole subjects that come with the package. Of several one must fit clearly better than the others.
+        By default those of whole subjects that come with the package. Of several one must fit clearly better than the
+        others.
     """
     if not skeleton.joint_count:
         return FoundNames()
@@ -91,7 +92,8 @@ def find_names(
     if best is None:
         return FoundNames(scores=scores)
     others = [0.0, *(score for name, score in scores.items() if name != best[0].name)]
-    if len(asked) > 1 and best[1][0].score - max(others) < SURE:
+    score = best[1][0].score
+    if len(asked) > 1 and (score - max(others) < SURE or decoy_score(posture, best[0], score - SURE) > score - SURE):
         return FoundNames(scores=scores)
     return _names(posture, best[0], best[1], scores)
 
@@ -139,9 +141,7 @@ def _names(posture: MeanPosture, template: NameTemplate, ways: list[TreeMatch], 
     )
 
 
-def _in_place(
-    posture: MeanPosture, way: TreeMatch, template: NameTemplate, body: int, parts: frozenset[int]
-) -> bool:
+def _in_place(posture: MeanPosture, way: TreeMatch, template: NameTemplate, body: int, parts: frozenset[int]) -> bool:
     """Whether a body lies on the side that its parts are on; pieces of a wrong tree may not."""
     tree = posture.tree
     center = way.turn @ (tree.centers[body] - tree.surfaces @ tree.centers)

@@ -1,17 +1,17 @@
 """Templates of known skeletons: parts with their joints, places, surfaces; each a plain TOML file.
 
-    name = "human"
-    [parts.thorax]                 # the one part without `parent` is the root
-    parent = "pelvis"
-    joint_name = "back"            # what the joint to the parent is called
-    joint = [0.0, 0.0, 0.63]       # its place: forward, left, up; any unit
-    center = [0.0, 0.0, 0.73]      # of the part's surface
-    tip = [0.0, 0.0, 1.0]          # farthest point of a part at the end of a limb
-    surface = 18                   # its share of the surface; any unit
-    mobility = 0.3                 # how far it usually turns in its joint, radians
-    pair = true                    # there are two, written down for the left one
-    [groups]                       # what several parts in one body are called
-    trunk = ["pelvis", "thorax"]
+name = "human"
+[parts.thorax]                 # the one part without `parent` is the root
+parent = "pelvis"
+joint_name = "back"            # what the joint to the parent is called
+joint = [0.0, 0.0, 0.63]       # its place: forward, left, up; any unit
+center = [0.0, 0.0, 0.73]      # of the part's surface
+tip = [0.0, 0.0, 1.0]          # farthest point of a part at the end of a limb
+surface = 18                   # its share of the surface; any unit
+mobility = 0.3                 # how far it usually turns in its joint, radians
+pair = true                    # there are two, written down for the left one
+[groups]                       # what several parts in one body are called
+trunk = ["pelvis", "thorax"]
 """
 
 from __future__ import annotations
@@ -114,6 +114,16 @@ def read_template(name: str | Path) -> NameTemplate:
         return _template(tomllib.loads(text), str(name))
     except tomllib.TOMLDecodeError as error:
         raise NamingError(f"{name}: not valid TOML ({error})") from None
+
+
+def is_template(name: str | Path) -> bool:
+    """Tell whether a name or file is a template, not a list of names; a file that can't be read is none."""
+    if str(name) in built_in_templates():
+        return True
+    try:
+        return "parts" in tomllib.loads(Path(name).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return False
 
 
 def _template(table: dict[str, Any], where: str) -> NameTemplate:

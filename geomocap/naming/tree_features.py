@@ -1,7 +1,7 @@
 """What a joint of a tree of bodies can be told by: what lies beyond it, how far it reaches, where it is.
 
-Every joint parts the bodies in two sides. One of them is *beyond* the joint, that which doesn't hold the trunk; which of
-them that is comes out of matching, so a found joint is looked at both ways.
+Every joint parts the bodies in two sides. One of them is *beyond* the joint, that which doesn't hold the trunk; which
+one comes out of matching, so a found joint is looked at both ways.
 """
 
 from __future__ import annotations

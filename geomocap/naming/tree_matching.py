@@ -1,9 +1,9 @@
 """Which joint of a template a found joint is: the likeliest assignment under which both trees are cut alike.
 
-A found joint that the template has no counterpart for cuts one of its parts in two; a joint of the template that was not
-found leaves two of its parts in one body. So bodies needn't be parts one to one. What must hold is the order: of two
-joints one lies beyond the other, or each apart from the other, in both trees alike. Under that condition the sum of the
-joints' log likelihood ratios (template's joint against a joint of anything) is greatest.
+A found joint that the template has no counterpart for cuts one of its parts in two; a joint of the template that was
+not found leaves two of its parts in one body. So bodies needn't be parts one to one. What must hold is the order: of
+two joints one lies beyond the other, or each apart from the other, in both trees alike. Under that condition the sum of
+the joints' log likelihood ratios (template's joint against a joint of anything) is greatest.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ LATERAL = 0.5  # of that to the sides: mean postures are nearly symmetric
 DEPENDENT = 0.5  # features of a joint overlap: their weight together
 SURE = 5.0  # log odds beyond which nobody asks
 TURNED = 4.0  # log odds of a motion that shows the heading clearly
+_TILTS = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [2, 0, 0]])  # quarter turns
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,40 @@ def match_tree(posture: MeanPosture, template: NameTemplate, least: float = -np.
     return sorted(ways.values(), key=lambda way: -way.score)
 
 
+def decoy_score(posture: MeanPosture, template: NameTemplate, least: float) -> float:
+    """Greatest score of a template lying on a side or upside down; `least` if none is above it.
+
+    Any tree can be matched to a template somehow; only one that is no such thing fits it as well turned over. Turns under
+    which the template looks like itself don't count.
+
+    Parameters
+    ----------
+    posture : MeanPosture
+    template : NameTemplate
+    least : float
+    """
+    cue = TURNED * float(np.linalg.norm(posture.heading))
+    perfect = _template_tree(template)
+    best = least
+    for tilt in Rotation.from_rotvec(np.pi / 2 * _TILTS).as_matrix():
+        told = _best_score(perfect, template, np.eye(3), -np.inf) - SURE
+        if _best_score(perfect, template, tilt, told) == told:  # else the template looks the same turned over
+            best = cue + _best_score(posture.tree, template, tilt, best - cue)
+    return best
+
+
+def _best_score(tree: PosedTree, template: NameTemplate, tilt: np.ndarray, least: float) -> float:
+    """Greatest score of a tilted template, whichever way it faces; `least` if none is above it."""
+    model = _template_model(template)
+    found = joint_features(tree, both_ways=True)
+    for turn in _turns(template):
+        gains = _gains(found, model, turn @ tilt)
+        if np.maximum(_best_by_joint(gains), 0).sum() > least:
+            chosen = _assign(found, model, gains, least)
+            least = least if chosen is None else _sum(gains, chosen)
+    return least
+
+
 def _match(found: JointFeatures, chosen: np.ndarray, turn: np.ndarray, score: float) -> TreeMatch:
     count = len(chosen) // 2
     parts, beyond = np.full(count, -1), found.beyond[:count].copy()
@@ -144,18 +179,21 @@ def _turns(template: NameTemplate) -> Iterator[np.ndarray]:
         yield from Rotation.from_rotvec([np.pi / 4, 0.0, 0.0]).as_matrix() @ cubes
 
 
-def _template_model(template: NameTemplate) -> _Model:
-    """Return a template's features with their spread: what is farther out along a limb strays farther."""
-    joints, hierarchy = template.joint_places[1:], template.hierarchy
-    count = len(template.parts)
+def _template_tree(template: NameTemplate) -> PosedTree:
+    joints, count = template.joint_places[1:], len(template.parts)
     lengths = np.full((count, count - 1), np.nan)
-    for j, both in enumerate(hierarchy.joint_bodies.tolist()):
+    for j, both in enumerate(template.hierarchy.joint_bodies.tolist()):
         for part in both:
             end = template.tips[part] if np.isfinite(template.tips[part]).all() else template.centers[part]
             lengths[part, j] = np.linalg.norm(end - joints[j])
-    features = joint_features(
-        PosedTree(hierarchy, joints, template.centers, lengths, template.surfaces), both_ways=False
-    )
+    return PosedTree(template.hierarchy, joints, template.centers, lengths, template.surfaces)
+
+
+def _template_model(template: NameTemplate) -> _Model:
+    """Return a template's features with their spread: what is farther out along a limb strays farther."""
+    tree = _template_tree(template)
+    features = joint_features(tree, both_ways=False)
+    joints, count = tree.joints, len(template.parts)
     inside = features.beyond[:, 1:].T & ~np.eye(count - 1, dtype=bool)  # [k, a]: joint k lies beyond joint a
     ways = np.linalg.norm(joints[:, None] - joints[None], axis=2) / features.diameter
     mobility = template.mobility[1:]
