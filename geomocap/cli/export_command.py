@@ -55,8 +55,8 @@ def report_exported(exported: Exported) -> None:
         console.print(f"{path}", markup=False)
     for reason in exported.skipped.values():
         console.print(f"not written: {reason}", markup=False)
-    if exported.found.template is not None:
-        found = exported.found
+    found = exported.found
+    if found.template is not None:
         sides = "" if found.sides_known else ", left and right not told: sides are a and b"
         console.print(f"named as {found.template.name}: {len(found.bodies)} bodies, {len(found.joints)} joints{sides}")
     console.print(f"largest deviation from skeleton.npz: {exported.deviation_mm:.3f} mm")

@@ -6,7 +6,7 @@ the two sides are called a and b. What isn't known keeps its number.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -105,10 +105,10 @@ def _names(posture: MeanPosture, template: NameTemplate, ways: list[TreeMatch], 
     bodies: dict[int, tuple[frozenset[int], float]] = {}
     sides_known = True
     for body in range(len(posture.tree.centers)):
-        held = Counter[frozenset[int]]()
+        held: dict[frozenset[int], float] = defaultdict(float)
         for weight, region in zip(weights, regions, strict=True):
             held[region[body]] += float(weight)
-        parts, share = held.most_common(1)[0]
+        parts, share = max(held.items(), key=lambda one: one[1])
         likelihood = sum(w for p, w in held.items() if _unsided(p, template) == _unsided(parts, template))
         if likelihood >= LIKELY and _in_place(posture, ways[0], template, body, parts):
             bodies[body] = parts, likelihood
@@ -153,10 +153,10 @@ def _likely_joint(
     joint: int, ways: list[TreeMatch], weights: np.ndarray, template: NameTemplate
 ) -> tuple[int, float] | None:
     """The part whose joint it is, and how likely, whichever the side; None: it may be none."""
-    held = Counter[int]()
+    held: dict[int, float] = defaultdict(float)
     for weight, way in zip(weights, ways, strict=True):
         held[int(way.joints[joint])] += float(weight)
-    part = held.most_common(1)[0][0]
+    part = max(held.items(), key=lambda one: one[1])[0]
     if part < 0:
         return None
     likelihood = sum(held[p] for p in {part, int(template.mirrored[part])})

@@ -26,7 +26,7 @@ LATERAL = 0.5  # of that to the sides: mean postures are nearly symmetric
 DEPENDENT = 0.5  # features of a joint overlap: their weight together
 SURE = 5.0  # log odds beyond which nobody asks
 TURNED = 4.0  # log odds of a motion that shows the heading clearly
-_TILTS = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [2, 0, 0]])  # quarter turns
+_TILTS = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])  # quarter turns
 
 
 @dataclass(frozen=True)
@@ -112,6 +112,7 @@ def match_tree(posture: MeanPosture, template: NameTemplate, least: float = -np.
         return []
     _, cue, turn, gains = tries[best[0]]
     chosen = _assign(found, model, gains)
+    assert chosen is not None, "the best way above was one"
     for v in np.flatnonzero(chosen >= 0).tolist():
         part = int(chosen[v]) + 1
         for barred in ([part], [part, int(template.mirrored[part])]):
@@ -127,10 +128,10 @@ def match_tree(posture: MeanPosture, template: NameTemplate, least: float = -np.
 
 
 def decoy_score(posture: MeanPosture, template: NameTemplate, least: float) -> float:
-    """Greatest score of a template lying on a side or upside down; `least` if none is above it.
+    """Greatest score of a template turned over by a quarter, to any side; `least` if none is above it.
 
-    Any tree can be matched to a template somehow; only one that is no such thing fits it as well turned over. Turns under
-    which the template looks like itself don't count.
+    Any tree can be matched to a template somehow; only one that is no such thing fits it as well turned over. (Upside
+    down is no test: a flat animal, a bird in flight, looks nearly the same then.)
 
     Parameters
     ----------
@@ -139,12 +140,9 @@ def decoy_score(posture: MeanPosture, template: NameTemplate, least: float) -> f
     least : float
     """
     cue = TURNED * float(np.linalg.norm(posture.heading))
-    perfect = _template_tree(template)
     best = least
     for tilt in Rotation.from_rotvec(np.pi / 2 * _TILTS).as_matrix():
-        told = _best_score(perfect, template, np.eye(3), -np.inf) - SURE
-        if _best_score(perfect, template, tilt, told) == told:  # else the template looks the same turned over
-            best = cue + _best_score(posture.tree, template, tilt, best - cue)
+        best = cue + _best_score(posture.tree, template, tilt, best - cue)
     return best
 
 
