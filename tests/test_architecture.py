@@ -42,7 +42,8 @@ ROOMS: dict[str, set[str]] = {
     "subject": VALUES | {"bodies", "files", "skeleton", "trajectories"},
     # out of the house
     "naming": VALUES,
-    "export": VALUES | {"files", "naming", "skeleton", "subject", "version"},
+    "angles": VALUES | {"naming", "skeleton"},
+    "export": VALUES | {"angles", "files", "naming", "skeleton", "subject", "version"},
     "evaluation": VALUES | {"carving", "files", "export", "skeleton", "subject"},
     "inspection": VALUES | {"files", "export", "evaluation"},
 }

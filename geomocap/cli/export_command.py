@@ -27,6 +27,7 @@ def export(
     usd: Annotated[bool, typer.Option("--usd", help="USD (UsdSkel): y up, m; needs the extra usd.")] = False,
     csv: Annotated[bool, typer.Option("--csv", help="CSV: world axes, m and degrees.")] = False,
     parquet: Annotated[bool, typer.Option("--parquet", help="Parquet, as CSV; needs the extra parquet.")] = False,
+    angles: Annotated[bool, typer.Option("--angles", help="angles.csv, angles.mot, angles.png: degrees.")] = False,
     with_skin: Annotated[bool, typer.Option("--skin", help="The same as --surface skin.")] = False,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; RUN if not given.")
@@ -40,6 +41,7 @@ def export(
     Example: `geomocap export RUN --glb --skin --skin-colors true`
     """
     asked = {"bvh": bvh, "trc": trc, "c3d": c3d, "glb": glb, "usd": usd, "csv": csv, "parquet": parquet}
+    asked |= {"angles": angles, "mot": angles}
     formats = [name for name, wanted in asked.items() if wanted] or None
     settings = config.export
     if with_skin:

@@ -22,6 +22,12 @@ class ExportSettings(Settings):
     name_set: Literal["plain", "opensim", "mixamo", "humanik", "coco"] = Field(
         "plain", description="whose words names are in", json_schema_extra={"flag": "name-set"}
     )
+    zero_frame: int | None = Field(
+        None,
+        ge=0,
+        description="frame in which all joint angles are zero; by default straight limbs have none",
+        json_schema_extra={"flag": "zero-frame"},
+    )
     joints: Literal["auto", "fixed", "moving"] = Field(
         "auto",
         description="fixed: constant offsets between joints; moving: every joint shifts in every frame; auto: only "

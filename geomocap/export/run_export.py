@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from geomocap.errors import RunError
+from geomocap.export.angle_files import angle_table, run_angles, write_mot
 from geomocap.export.bvh import write_bvh
 from geomocap.export.c3d import write_c3d
 from geomocap.export.conventions import Axis
@@ -43,6 +44,8 @@ FILES = {
     "usd": "motion.usdc",
     "csv": "motion.csv",
     "parquet": "motion.parquet",
+    "angles": "angles.csv",
+    "mot": "angles.mot",
 }
 
 
@@ -86,7 +89,7 @@ def export_run(
     run : Run
         With `skeleton.npz`.
     formats : sequence of str, optional
-        Of bvh, trc, c3d, glb, usd, csv, parquet. By default all whose packages are installed.
+        Of those in `FILES`. By default all whose packages are installed.
     settings : ExportSettings, optional
         By default those of the run.
     names : Names, optional
@@ -114,7 +117,11 @@ def export_run(
     motion = motion_from_skeleton(skeleton, up=up, names=names, joints=settings.joints, radius=mean_radius(run))
     markers = run_markers(run, skeleton, names, up, ellipsoids=settings.ellipsoids)
     mesh = surface_of_run(run, motion, settings)
-    writers = _writers(motion, markers, mesh, settings)
+    angles = run_angles(run, skeleton, names, found, settings)
+    writers = _writers(motion, markers, mesh, settings) | {
+        "angles": lambda path: write_csv(path, angle_table(angles)),
+        "mot": lambda path: write_mot(path, angles),
+    }
     files, skipped = {}, {}
     chosen = list(formats) if formats is not None else list(FILES)
     for k, name in enumerate(chosen):

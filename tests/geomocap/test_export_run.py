@@ -31,7 +31,7 @@ def test_every_format_whose_package_is_there(run):
     assert all(file.stat().st_size > 100 for file in exported.files.values())
     assert exported.deviation_mm < 0.1
     assert exported.moving_joints == ()
-    assert reports[-1] == ("export", 7, 7)
+    assert reports[-1] == ("export", 9, 9)
     assert not list(run.path.glob(".*.tmp*"))
 
 
