@@ -28,6 +28,8 @@ def export(
     csv: Annotated[bool, typer.Option("--csv", help="CSV: world axes, m and degrees.")] = False,
     parquet: Annotated[bool, typer.Option("--parquet", help="Parquet, as CSV; needs the extra parquet.")] = False,
     angles: Annotated[bool, typer.Option("--angles", help="angles.csv, angles.mot, angles.png: degrees.")] = False,
+    osim: Annotated[bool, typer.Option("--osim", help="OpenSim model and motion: y up, m.")] = False,
+    urdf: Annotated[bool, typer.Option("--urdf", help="URDF with meshes and joint positions: z up, m.")] = False,
     with_skin: Annotated[bool, typer.Option("--skin", help="The same as --surface skin.")] = False,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; RUN if not given.")
@@ -36,12 +38,12 @@ def export(
 ) -> None:
     """Write motion files of a run for Blender, OpenSim, C3D tools, game engines and plots.
 
-    Without a format all are written whose packages are installed.
+    Without a format all are written whose packages are installed, but OpenSim's and URDF.
 
     Example: `geomocap export RUN --glb --skin --skin-colors true`
     """
     asked = {"bvh": bvh, "trc": trc, "c3d": c3d, "glb": glb, "usd": usd, "csv": csv, "parquet": parquet}
-    asked |= {"angles": angles, "mot": angles}
+    asked |= {"angles": angles, "mot": angles, "osim": osim, "urdf": urdf}
     formats = [name for name, wanted in asked.items() if wanted] or None
     settings = config.export
     if with_skin:

@@ -28,6 +28,9 @@ class ExportSettings(Settings):
         description="frame in which all joint angles are zero; by default straight limbs have none",
         json_schema_extra={"flag": "zero-frame"},
     )
+    density: float = Field(
+        1000.0, gt=0, description="density that gives OpenSim's and URDF's bodies their mass (kg/m³)"
+    )
     joints: Literal["auto", "fixed", "moving"] = Field(
         "auto",
         description="fixed: constant offsets between joints; moving: every joint shifts in every frame; auto: only "

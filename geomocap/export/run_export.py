@@ -12,20 +12,23 @@ from geomocap.errors import RunError
 from geomocap.export.angle_files import angle_table, run_angles, write_mot
 from geomocap.export.bvh import write_bvh
 from geomocap.export.c3d import write_c3d
-from geomocap.export.conventions import Axis
+from geomocap.export.conventions import Axis, Convention
 from geomocap.export.export_errors import MissingPackageError, MotionError
 from geomocap.export.export_settings import ExportSettings
 from geomocap.export.glb import write_glb
+from geomocap.export.linked_bodies import LinkedBodies, linked_bodies
 from geomocap.export.markers import Markers, markers_from_run
 from geomocap.export.model_skin import skin_from_model
 from geomocap.export.motion_tree import MotionTree
 from geomocap.export.names import Names
+from geomocap.export.osim import OSIM, write_osim
 from geomocap.export.run_names import NAMES_FOUND, names_text, run_names
 from geomocap.export.skeleton_motion import UNKNOWN_RADIUS, motion_from_skeleton
 from geomocap.export.skin import skin_from_run
 from geomocap.export.skinned_mesh import SkinnedMesh
 from geomocap.export.tables import motion_table, write_csv, write_parquet
 from geomocap.export.trc import write_trc
+from geomocap.export.urdf import URDF, write_urdf
 from geomocap.export.usd import write_usd
 from geomocap.files.atomic import write_text
 from geomocap.files.results import ELLIPSOIDS, KEYPOINTS, read_ellipsoids, read_keypoint_paths, read_skeleton
@@ -46,7 +49,10 @@ FILES = {
     "parquet": "motion.parquet",
     "angles": "angles.csv",
     "mot": "angles.mot",
+    "osim": "motion.osim",
+    "urdf": "motion.urdf",
 }
+ON_REQUEST = ("osim", "urdf")  # formats that are not written unless asked for
 
 
 @dataclass(frozen=True)
@@ -89,7 +95,7 @@ def export_run(
     run : Run
         With `skeleton.npz`.
     formats : sequence of str, optional
-        Of those in `FILES`. By default all whose packages are installed.
+        Of those in `FILES`. By default all whose packages are installed but those `ON_REQUEST`.
     settings : ExportSettings, optional
         By default those of the run.
     names : Names, optional
@@ -117,13 +123,23 @@ def export_run(
     motion = motion_from_skeleton(skeleton, up=up, names=names, joints=settings.joints, radius=mean_radius(run))
     markers = run_markers(run, skeleton, names, up, ellipsoids=settings.ellipsoids)
     mesh = surface_of_run(run, motion, settings)
+
+    def links(convention: Convention) -> LinkedBodies:
+        fixed = motion_from_skeleton(skeleton, up=up, names=names, joints="fixed", radius=mean_radius(run))
+        bodies = (names or Names()).body_names(skeleton.body_count, skeleton.body_names)
+        labels = (names or Names()).joint_names(skeleton.joint_bodies, bodies, skeleton.joint_names)
+        density, radius = settings.density, mean_radius(run)
+        return linked_bodies(fixed, mesh, labels, convention, density=density, radius=radius)
+
     angles = run_angles(run, skeleton, names, found, settings)
     writers = _writers(motion, markers, mesh, settings) | {
         "angles": lambda path: write_csv(path, angle_table(angles)),
         "mot": lambda path: write_mot(path, angles),
+        "osim": lambda path: write_osim(path, links(OSIM)),
+        "urdf": lambda path: write_urdf(path, links(URDF)),
     }
     files, skipped = {}, {}
-    chosen = list(formats) if formats is not None else list(FILES)
+    chosen = list(formats) if formats is not None else [name for name in FILES if name not in ON_REQUEST]
     for k, name in enumerate(chosen):
         path = (folder or run.path) / FILES[name]
         try:
