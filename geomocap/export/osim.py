@@ -1,7 +1,7 @@
 """OpenSim model and motion: bodies with their surfaces, hinges and balls as found, a free root; y up, metres, radians.
 
-A hinge is a PinJoint about z of its frames, a ball a BallJoint, the root a FreeJoint; the last two have body-fixed angles
-X, Y, Z as coordinates, called after the joint with _rx, _ry, _rz (and _tx, _ty, _tz).
+A hinge is a PinJoint about z of its frames, a ball a BallJoint, the root a FreeJoint; the last two have body-fixed
+angles X, Y, Z as coordinates, called after the joint with _rx, _ry, _rz (and _tx, _ty, _tz).
 """
 
 from __future__ import annotations
