@@ -76,7 +76,9 @@ def test_urdf_replays_the_skeleton_by_its_joints_and_their_positions(run, skelet
         R, p = placed[f"body{child:02d}"]
         assert np.abs(p - skeleton.joint_positions[:, j]).max() < 1e-4
         assert np.abs(R - skeleton.body_rotations[:, child]).max() < 1e-4
-    assert [j.get("name") for j in robot.findall("joint")][-1] == str(skeleton.joint_names[-1]), "one joint of a hinge"
+    revolute = [joint.get("name") for joint in robot.findall("joint")]
+    assert len(revolute) == 4 * 3 + 1
+    assert str(skeleton.joint_names[-1]) in revolute, "the hinge is one joint"
 
 
 def test_opensim_model_replays_the_skeleton_by_its_coordinates(run, skeleton):
@@ -99,7 +101,7 @@ def test_opensim_model_replays_the_skeleton_by_its_coordinates(run, skeleton):
             origin = origin + q[:, 3:]
         placed[after.find("socket_parent").text] = R @ tilt @ turn @ tilt.T, origin
         kinds.append(joint.tag)
-    assert kinds == ["FreeJoint", *["BallJoint"] * 4, "PinJoint"]
+    assert sorted(kinds) == [*["BallJoint"] * 4, "FreeJoint", "PinJoint"]
     for j, (_, child) in enumerate(skeleton.joint_bodies):
         R, p = placed[f"/bodyset/body{child:02d}"]
         assert np.abs(p - skeleton.joint_positions[:, j] @ Y_UP.T).max() < 1e-4
