@@ -13,7 +13,9 @@ from geomocap.cli.progress_bars import progress_bars
 from geomocap.cli.settings_options import with_settings
 from geomocap.config import Config
 from geomocap.export.run_export import Exported, export_run
+from geomocap.files.atomic import write_atomic
 from geomocap.files.run import Run
+from viz.angle_plots import angle_sheet
 
 
 @with_settings("export")
@@ -30,6 +32,10 @@ def export(
     angles: Annotated[bool, typer.Option("--angles", help="angles.csv, angles.mot, angles.png: degrees.")] = False,
     osim: Annotated[bool, typer.Option("--osim", help="OpenSim model and motion: y up, m.")] = False,
     urdf: Annotated[bool, typer.Option("--urdf", help="URDF with meshes and joint positions: z up, m.")] = False,
+    movement: Annotated[
+        bool, typer.Option("--movement", help="netCDF for the package movement; needs the extra movement.")
+    ] = False,
+    fbx: Annotated[bool, typer.Option("--fbx", help="FBX through Blender, where it is installed.")] = False,
     with_skin: Annotated[bool, typer.Option("--skin", help="The same as --surface skin.")] = False,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; RUN if not given.")
@@ -38,18 +44,21 @@ def export(
 ) -> None:
     """Write motion files of a run for Blender, OpenSim, C3D tools, game engines and plots.
 
-    Without a format all are written whose packages are installed, but OpenSim's and URDF.
+    Without a format all are written whose packages are installed, but --osim, --urdf, --movement, --fbx.
 
     Example: `geomocap export RUN --glb --skin --skin-colors true`
     """
     asked = {"bvh": bvh, "trc": trc, "c3d": c3d, "glb": glb, "usd": usd, "csv": csv, "parquet": parquet}
-    asked |= {"angles": angles, "mot": angles, "osim": osim, "urdf": urdf}
+    asked |= {"angles": angles, "mot": angles, "osim": osim, "urdf": urdf, "movement": movement, "fbx": fbx}
     formats = [name for name, wanted in asked.items() if wanted] or None
     settings = config.export
     if with_skin:
         settings = settings.model_copy(update={"surface": "skin"})
     with progress_bars() as progress:
         exported = export_run(Run(run), formats, settings, folder=out, progress=progress)
+    if angles and exported.angles is not None and exported.angles.names:
+        picture = angle_sheet(exported.angles)
+        write_atomic(exported.files["angles"].with_suffix(".png"), lambda p: p.write_bytes(picture))
     report_exported(exported)
 
 

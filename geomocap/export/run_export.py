@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from geomocap.angles.angle_set import AngleSet
 from geomocap.errors import RunError
 from geomocap.export.angle_files import angle_table, run_angles, write_mot
 from geomocap.export.bvh import write_bvh
@@ -15,11 +17,13 @@ from geomocap.export.c3d import write_c3d
 from geomocap.export.conventions import Axis, Convention
 from geomocap.export.export_errors import MissingPackageError, MotionError
 from geomocap.export.export_settings import ExportSettings
+from geomocap.export.fbx import write_fbx
 from geomocap.export.glb import write_glb
 from geomocap.export.linked_bodies import LinkedBodies, linked_bodies
 from geomocap.export.markers import Markers, markers_from_run
 from geomocap.export.model_skin import skin_from_model
 from geomocap.export.motion_tree import MotionTree
+from geomocap.export.movement_dataset import write_movement
 from geomocap.export.names import Names
 from geomocap.export.osim import OSIM, write_osim
 from geomocap.export.run_names import NAMES_FOUND, names_text, run_names
@@ -51,8 +55,10 @@ FILES = {
     "mot": "angles.mot",
     "osim": "motion.osim",
     "urdf": "motion.urdf",
+    "movement": "motion.nc",
+    "fbx": "motion.fbx",
 }
-ON_REQUEST = ("osim", "urdf")  # formats that are not written unless asked for
+ON_REQUEST = ("osim", "urdf", "movement", "fbx")  # formats that are not written unless asked for
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,8 @@ class Exported:
         Nodes that shift against their parents, because their joints are not fixed in the bodies.
     found : FoundNames
         Names from a template.
+    angles : AngleSet or None
+        Of all joints.
     """
 
     files: dict[str, Path]
@@ -77,6 +85,7 @@ class Exported:
     deviation_mm: float = 0.0
     moving_joints: tuple[str, ...] = ()
     found: FoundNames = field(default_factory=FoundNames)
+    angles: AngleSet | None = None
 
 
 def export_run(
@@ -137,6 +146,8 @@ def export_run(
         "mot": lambda path: write_mot(path, angles),
         "osim": lambda path: write_osim(path, links(OSIM)),
         "urdf": lambda path: write_urdf(path, links(URDF)),
+        "fbx": lambda path: _write_fbx(path, motion, mesh),
+        "movement": lambda path: write_movement(path, markers),
     }
     files, skipped = {}, {}
     chosen = list(formats) if formats is not None else [name for name in FILES if name not in ON_REQUEST]
@@ -153,7 +164,7 @@ def export_run(
     if found.template is not None:
         write_text((folder or run.path) / NAMES_FOUND, names_text(found))
     shifting = tuple(n for n, m, j in zip(motion.names, motion.moving, motion.joints, strict=True) if m and j >= 0)
-    return Exported(files, skipped, motion.largest_deviation_mm(skeleton.joint_positions), shifting, found)
+    return Exported(files, skipped, motion.largest_deviation_mm(skeleton.joint_positions), shifting, found, angles)
 
 
 def run_settings(run: Run) -> ExportSettings:
@@ -194,6 +205,13 @@ def surface_of_run(run: Run, motion: MotionTree, settings: ExportSettings) -> Sk
     if (run.path / MODEL_FILE).is_file() and settings.skin_frame == 0:
         return skin_from_model(read_model(run.path / MODEL_FILE), motion, settings)
     return skin_from_run(run, motion, settings) if settings.surface == "skin" else None
+
+
+def _write_fbx(path: Path, motion: MotionTree, mesh: SkinnedMesh | None) -> None:
+    with TemporaryDirectory() as folder:
+        glb = Path(folder) / FILES["glb"]
+        write_glb(glb, motion, mesh)
+        write_fbx(path, glb, motion.fps)
 
 
 def _writers(
