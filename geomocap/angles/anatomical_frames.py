@@ -106,6 +106,8 @@ def _limb(
     start, middle, end = places
     inner, outer = (bodies.get(name) for name in names)
     rest = skeleton.body_positions[0]
+    if middle is None and inner is not None and outer is not None and inner != outer:
+        middle = skeleton.joint_positions[0, _last_joint(skeleton, inner, outer)]
     if inner is not None and start is not None:
         down = (rest[inner] if middle is None or inner == outer else middle) - start
         across = world[:, 2]
@@ -116,6 +118,19 @@ def _limb(
             axes[names[0]] = axes_of(-down, across, keep="across")
         else:
             axes[names[0]] = axes_of(-down, across, keep="long")
+
+
+def _last_joint(skeleton: Skeleton, inner: int, outer: int) -> int:
+    """The joint by which a body hangs on another, whatever lies between them."""
+    pairs = skeleton.joint_bodies
+    reached, before = [inner], {}
+    for body in reached:
+        for j in np.flatnonzero((pairs == body).any(axis=1)).tolist():
+            other = int(pairs[j].sum()) - body
+            if other not in reached:
+                before[other] = j
+                reached.append(other)
+    return int(before[outer])
 
 
 def _bending_axis(

@@ -22,6 +22,12 @@ class ExportSettings(Settings):
     name_set: Literal["plain", "opensim", "mixamo", "humanik", "coco"] = Field(
         "plain", description="whose words names are in", json_schema_extra={"flag": "name-set"}
     )
+    rest_pose: Literal["first", "T", "A"] = Field(
+        "first",
+        description="pose of a skeleton whose joints are not turned, in BVH, GLB and USD: the first frame, or a person "
+        "standing with arms to the sides (T) or half down (A), for retargeting",
+        json_schema_extra={"flag": "rest-pose"},
+    )
     zero_frame: int | None = Field(
         None,
         ge=0,

@@ -19,6 +19,8 @@ fps = float(sys.argv[-1])
 bpy.context.scene.render.fps = max(1, round(fps))
 bpy.context.scene.render.fps_base = max(1, round(fps)) / fps
 bpy.ops.import_scene.gltf(filepath=sys.argv[-3])
+for shown in [o for o in bpy.data.objects if o.type == "MESH" and not o.modifiers]:
+    bpy.data.objects.remove(shown)  # the importer's own picture of a bone
 last = max((a.frame_range[1] for a in bpy.data.actions), default=1)
 bpy.context.scene.frame_start, bpy.context.scene.frame_end = 0, round(last)
 bpy.ops.export_scene.fbx(filepath=sys.argv[-2], add_leaf_bones=False, bake_anim_simplify_factor=0.0)

@@ -26,6 +26,7 @@ from geomocap.export.motion_tree import MotionTree
 from geomocap.export.movement_dataset import write_movement
 from geomocap.export.names import Names
 from geomocap.export.osim import OSIM, write_osim
+from geomocap.export.rest_pose import at_rest
 from geomocap.export.run_names import NAMES_FOUND, names_text, run_names
 from geomocap.export.skeleton_motion import UNKNOWN_RADIUS, motion_from_skeleton
 from geomocap.export.skin import skin_from_run
@@ -132,6 +133,7 @@ def export_run(
     motion = motion_from_skeleton(skeleton, up=up, names=names, joints=settings.joints, radius=mean_radius(run))
     markers = run_markers(run, skeleton, names, up, ellipsoids=settings.ellipsoids)
     mesh = surface_of_run(run, motion, settings)
+    shown, skinned = at_rest(motion, mesh, found, settings.rest_pose)
 
     def links(convention: Convention) -> LinkedBodies:
         fixed = motion_from_skeleton(skeleton, up=up, names=names, joints="fixed", radius=mean_radius(run))
@@ -141,12 +143,12 @@ def export_run(
         return linked_bodies(fixed, mesh, labels, convention, density=density, radius=radius)
 
     angles = run_angles(run, skeleton, names, found, settings)
-    writers = _writers(motion, markers, mesh, settings) | {
+    writers = _writers(motion, markers, shown, skinned, settings) | {
         "angles": lambda path: write_csv(path, angle_table(angles)),
         "mot": lambda path: write_mot(path, angles),
         "osim": lambda path: write_osim(path, links(OSIM)),
         "urdf": lambda path: write_urdf(path, links(URDF)),
-        "fbx": lambda path: _write_fbx(path, motion, mesh),
+        "fbx": lambda path: _write_fbx(path, shown, skinned),
         "movement": lambda path: write_movement(path, markers),
     }
     files, skipped = {}, {}
@@ -215,14 +217,14 @@ def _write_fbx(path: Path, motion: MotionTree, mesh: SkinnedMesh | None) -> None
 
 
 def _writers(
-    motion: MotionTree, markers: Markers, mesh: SkinnedMesh | None, settings: ExportSettings
+    motion: MotionTree, markers: Markers, shown: MotionTree, mesh: SkinnedMesh | None, settings: ExportSettings
 ) -> dict[str, Callable[[Path], None]]:
     return {
-        "bvh": lambda path: write_bvh(path, motion, unit=settings.bvh_unit),
+        "bvh": lambda path: write_bvh(path, shown, unit=settings.bvh_unit),
         "trc": lambda path: write_trc(path, markers, unit=settings.trc_unit),
         "c3d": lambda path: write_c3d(path, markers, motion),
-        "glb": lambda path: write_glb(path, motion, mesh),
-        "usd": lambda path: write_usd(path, motion, mesh),
+        "glb": lambda path: write_glb(path, shown, mesh),
+        "usd": lambda path: write_usd(path, shown, mesh),
         "csv": lambda path: write_csv(path, motion_table(markers, motion)),
         "parquet": lambda path: write_parquet(path, motion_table(markers, motion)),
     }

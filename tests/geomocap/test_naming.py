@@ -3,8 +3,12 @@ from itertools import product
 import numpy as np
 import pytest
 
+from geomocap.export.export_errors import MotionError
 from geomocap.export.export_settings import ExportSettings
+from geomocap.export.rest_pose import at_rest
 from geomocap.export.run_export import export_run
+from geomocap.export.skeleton_motion import motion_from_skeleton
+from geomocap.export.skinned_mesh import bone_mesh
 from geomocap.export.trc import read_trc
 from geomocap.files.run import Run
 from geomocap.model.skeleton import Skeleton
@@ -170,3 +174,31 @@ def test_the_users_names_go_first_and_none_means_numbers(run, tmp_path):
     assert not (tmp_path / "none" / "names_found.toml").exists()
     with pytest.raises(NamingError, match="snail"):
         export_run(run, ["trc"], ExportSettings(names="snail"))
+
+
+@pytest.mark.parametrize("pose", ["T", "A"])
+def test_a_rest_pose_changes_the_skeleton_but_not_the_motion(pose):
+    skeleton, labels = figure(HUMAN, turn=0.7)
+    found = find_names(skeleton, 2)
+    motion = motion_from_skeleton(skeleton)
+    mesh = bone_mesh(motion)
+    rested, bound = at_rest(motion, mesh, found, pose)
+    assert rested.largest_deviation_mm(skeleton.joint_positions) < 1e-6
+    assert bound is not None
+    assert bound.bind_frame is None
+    assert np.abs(bound.posed(rested) - mesh.posed(motion)).max() < 1e-9
+    R, p = rested.bind_pose(None)
+    assert np.abs(R - np.eye(3)).max() == 0
+    place = {labels[b]: p[n] for n, b in enumerate(rested.bodies)}
+    left = np.array([-np.sin(0.7), np.cos(0.7), 0])
+    along = place["hand_left"] - place["upper_arm_left"]
+    wanted = left if pose == "T" else (left - [0, 0, 1]) / np.sqrt(2)
+    assert along @ wanted > 0.98 * np.linalg.norm(along)
+    leg = place["foot_right"] - place["thigh_right"]
+    assert leg[2] < -0.99 * np.linalg.norm(leg)
+
+
+def test_a_rest_pose_of_a_person_needs_a_person():
+    skeleton, _ = figure(QUADRUPED)
+    with pytest.raises(MotionError, match="rest pose"):
+        at_rest(motion_from_skeleton(skeleton), None, find_names(skeleton, 2), "T")
