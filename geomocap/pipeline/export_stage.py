@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from geomocap.export.run_export import FILES, export_run
 from geomocap.files.atomic import fingerprint
 from geomocap.files.run import stage_key
@@ -18,7 +20,9 @@ def motion_files(job: Job, source: Source) -> str:
     if not (job.run.path / "skeleton.npz").exists():
         return segmented
     check(job, segmented)
-    beside = fingerprint(job.run.path / name for name in ("names.toml", "keypoints.npz"))
+    named = Path(job.config.export.names)
+    files = [job.run.path / name for name in ("names.toml", "keypoints.npz")] + [named] * named.is_file()
+    beside = fingerprint(files)
     key = stage_key(__name__, "export", segmented, job.config.export.model_dump(), job.up, beside)
 
     def work() -> int:
