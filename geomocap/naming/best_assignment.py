@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-MOST_NODES = 50_000  # of the search; the best found so far is returned then
+MOST_NODES = 10_000  # of the search; the best found so far is returned then
 
 
 def heaviest_choices(

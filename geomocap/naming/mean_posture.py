@@ -118,7 +118,7 @@ def _lengths(skeleton: Skeleton, surface: BodySurface | None) -> tuple[np.ndarra
         shares = np.bincount(surface.bodies, minlength=skeleton.body_count).astype(float)
     else:
         shares = np.nanmax(lengths, axis=1)
-    shares = np.maximum(shares, 1e-3 * shares.sum())
+    shares = np.maximum(shares, max(1e-3 * shares.sum(), 1e-12))
     return lengths, shares / shares.sum()
 
 

@@ -72,7 +72,7 @@ def joint_features(tree: PosedTree, *, both_ways: bool) -> JointFeatures:
     pairs = tree.hierarchy.joint_bodies
     outward = _outward(tree.hierarchy)
     reach = _reaches(tree)
-    diameter = float(reach.sum(axis=1).max())
+    diameter = max(float(reach.sum(axis=1).max()), 1e-9)
     beyond = np.concatenate([outward, ~outward]) if both_ways else outward
     joint = np.tile(np.arange(len(pairs)), 2 if both_ways else 1)
     reach = np.concatenate([reach[:, 0], reach[:, 1]]) if both_ways else reach[:, 0]

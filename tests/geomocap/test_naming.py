@@ -202,3 +202,16 @@ def test_a_rest_pose_of_a_person_needs_a_person():
     skeleton, _ = figure(QUADRUPED)
     with pytest.raises(MotionError, match="rest pose"):
         at_rest(motion_from_skeleton(skeleton), None, find_names(skeleton, 2), "T")
+
+
+@pytest.mark.parametrize("what", ["one body", "one frame", "no joints", "all in one place", "no rotation", "many"])
+def test_subjects_of_which_little_is_known_keep_their_numbers(what):
+    arrays = skeleton_arrays({"one body": 1, "many": 30}.get(what, 6), 1 if what == "one frame" else 10)
+    if what == "no joints":
+        arrays["joint_positions"][:] = np.nan
+    if what == "all in one place":
+        arrays["joint_positions"][:] = 0
+        arrays["body_positions"][:] = 0
+    if what == "no rotation":
+        arrays["body_rotations"][:, 3] = np.nan
+    assert find_names(skeleton_of(arrays), 2).bodies == {}
