@@ -15,11 +15,12 @@ import numpy as np
 from geomocap.model.skeleton import Skeleton
 from geomocap.naming.mean_posture import BodySurface, MeanPosture, mean_posture
 from geomocap.naming.name_templates import SIDES, NameTemplate, read_template
-from geomocap.naming.tree_matching import SURE, TreeMatch, decoy_score, match_tree
+from geomocap.naming.tree_matching import SURE, TreeMatch, body_places, decoy_score, match_tree, part_places
 
 LIKELY = 0.7  # a name is given
 CERTAIN = 0.9  # left and right are told
 AUTOMATIC = ("human", "quadruped", "bird")  # a hand may lie anyhow; with few joints most trees would fit it
+FAR = 3.0  # standard deviations within which a body lies
 MOST_WORDS = 3  # of parts in one body's name
 
 
@@ -104,13 +105,14 @@ def _names(posture: MeanPosture, template: NameTemplate, ways: list[TreeMatch], 
     regions = [_regions(way, template) for way in ways]
     bodies: dict[int, tuple[frozenset[int], float]] = {}
     sides_known = True
+    places = body_places(posture, ways[0].turn)
     for body in range(len(posture.tree.centers)):
         held: dict[frozenset[int], float] = defaultdict(float)
         for weight, region in zip(weights, regions, strict=True):
             held[region[body]] += float(weight)
         parts, share = max(held.items(), key=lambda one: one[1])
         likelihood = sum(w for p, w in held.items() if _unsided(p, template) == _unsided(parts, template))
-        if likelihood >= LIKELY and _in_place(posture, ways[0], template, body, parts):
+        if likelihood >= LIKELY and _in_place(places[body], parts, template):
             bodies[body] = parts, likelihood
             if _side(parts, template) and share < CERTAIN * likelihood:
                 sides_known = False
@@ -141,12 +143,16 @@ def _names(posture: MeanPosture, template: NameTemplate, ways: list[TreeMatch], 
     )
 
 
-def _in_place(posture: MeanPosture, way: TreeMatch, template: NameTemplate, body: int, parts: frozenset[int]) -> bool:
-    """Whether a body lies on the side that its parts are on; pieces of a wrong tree may not."""
-    tree = posture.tree
-    center = way.turn @ (tree.centers[body] - tree.surfaces @ tree.centers)
+def _in_place(place: np.ndarray, parts: frozenset[int], template: NameTemplate) -> bool:
+    """Whether a body lies where its parts can be, and on their side; pieces of a wrong tree may not."""
+    if not parts or not template.upright:
+        return bool(parts)
+    places, stray = part_places(template)
+    mine = sorted(parts)
+    low, high = places[mine] - FAR * stray[mine], places[mine] + FAR * stray[mine]
     side = _side(parts, template)
-    return not (side and template.upright) or bool((center[1] > 0) == (side == "left"))
+    inside = (place >= low.min(axis=0)).all() and (place <= high.max(axis=0)).all()
+    return bool(inside) and (not side or (place[1] > 0) == (side == "left"))
 
 
 def _likely_joint(

@@ -158,6 +158,42 @@ def _best_score(tree: PosedTree, template: NameTemplate, tilt: np.ndarray, least
     return least
 
 
+def part_places(template: NameTemplate) -> tuple[np.ndarray, np.ndarray]:
+    """Centres of a template's parts, (K, 3), from the middle of all, and how far they stray, (K, 3).
+
+    In shares of the longest way through the tree: forward, left and up.
+
+    Parameters
+    ----------
+    template : NameTemplate
+    """
+    tree = _template_tree(template)
+    diameter = joint_features(tree, both_ways=False).diameter
+    places = (template.centers - template.surfaces @ template.centers) / diameter
+    stray = np.full(len(template.parts), PLACE**2)
+    for k in range(1, len(template.parts)):
+        joint = k
+        while joint > 0:
+            lever = np.linalg.norm(template.centers[k] - template.joint_places[joint]) / diameter
+            stray[k] += (template.mobility[joint] * lever) ** 2
+            joint = int(template.parents[joint])
+    return places, np.sqrt(stray)[:, None] * [1.0, LATERAL, 1.0]
+
+
+def body_places(posture: MeanPosture, turn: np.ndarray) -> np.ndarray:
+    """Centres of a posture's bodies, (B, 3), from the middle of all, as `part_places` has them.
+
+    Parameters
+    ----------
+    posture : MeanPosture
+    turn : (3, 3) float
+        Template's axes from the posture's.
+    """
+    tree = posture.tree
+    diameter = joint_features(tree, both_ways=False).diameter
+    return (tree.centers - tree.surfaces @ tree.centers) @ turn.T / diameter
+
+
 def _match(found: JointFeatures, chosen: np.ndarray, turn: np.ndarray, score: float) -> TreeMatch:
     count = len(chosen) // 2
     parts, beyond = np.full(count, -1), found.beyond[:count].copy()
