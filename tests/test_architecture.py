@@ -42,7 +42,9 @@ ROOMS: dict[str, set[str]] = {
     "motion": VALUES | {"bodies", "nodes", "skeleton", "trajectories"},
     "subject": VALUES | {"bodies", "files", "skeleton", "trajectories"},
     # out of the house
-    "export": VALUES | {"files", "skeleton", "subject", "version"},
+    "naming": VALUES,
+    "angles": VALUES | {"naming", "skeleton"},
+    "export": VALUES | {"angles", "files", "naming", "skeleton", "subject", "version"},
     "evaluation": VALUES | {"carving", "files", "silhouettes", "export", "skeleton", "subject"},
     "inspection": VALUES | {"files", "export", "evaluation", "subject"},
 }
@@ -51,7 +53,7 @@ ROOMS["pipeline"] = set(ROOMS)
 ROOMS["geomocap"] = set(ROOMS)
 ROOMS["data_tools"] = VALUES | {"files", "silhouettes"}
 ROOMS["viz"] = VALUES | {"files", "calibration", "keypoints", "trajectories", "dense", "matching"}
-ROOMS["viz"] |= {"export", "evaluation", "inspection"}
+ROOMS["viz"] |= {"angles", "export", "evaluation", "inspection"}
 ROOMS["cli"] = set(ROOMS)
 ROOMS["__main__"] = {"cli"}
 

@@ -14,11 +14,13 @@ from geomocap.cli.progress_bars import progress_bars
 from geomocap.cli.reports import existing_run, tell_faults, working
 from geomocap.cli.settings_options import with_settings
 from geomocap.config import Config
-from geomocap.export.names import Names
 from geomocap.export.run_export import Exported, export_run
+from geomocap.export.run_names import NAMES_FOUND
+from geomocap.files.atomic import write_bytes
 from geomocap.files.result_schemas import skeleton_gaps
 from geomocap.files.results import read_skeleton
 from geomocap.files.run import Run
+from viz.angle_plots import angle_sheet
 
 
 @with_settings("export")
@@ -32,11 +34,14 @@ def export(
     usd: Annotated[bool, typer.Option("--usd", help="USD (UsdSkel): y up, m; needs the extra usd.")] = False,
     csv: Annotated[bool, typer.Option("--csv", help="CSV: world axes, m and degrees.")] = False,
     parquet: Annotated[bool, typer.Option("--parquet", help="Parquet, as CSV; needs the extra parquet.")] = False,
+    angles: Annotated[bool, typer.Option("--angles", help="angles.csv, angles.mot, angles.png: degrees.")] = False,
+    osim: Annotated[bool, typer.Option("--osim", help="OpenSim model and motion: y up, m.")] = False,
+    urdf: Annotated[bool, typer.Option("--urdf", help="URDF with meshes and joint positions: z up, m.")] = False,
+    movement: Annotated[
+        bool, typer.Option("--movement", help="netCDF for the package movement; needs the extra movement.")
+    ] = False,
+    fbx: Annotated[bool, typer.Option("--fbx", help="FBX through Blender, where it is installed.")] = False,
     with_skin: Annotated[bool, typer.Option("--skin", help="The same as --surface skin.")] = False,
-    names: Annotated[
-        Path | None,
-        typer.Option("--names", metavar="FILE.toml", help="Names: thigh_left = 3 …; RUN/names.toml if not given."),
-    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; RUN if not given.")
     ] = None,
@@ -45,11 +50,12 @@ def export(
 ) -> None:
     """Write motion files of a run for Blender, OpenSim, C3D tools, game engines and plots.
 
-    Without a format all are written whose packages are installed.
+    Without a format all are written whose packages are installed, but --osim, --urdf, --movement, --fbx.
 
     Example: `geomocap export RUN --glb --skin --skin-colors true`
     """
     asked = {"bvh": bvh, "trc": trc, "c3d": c3d, "glb": glb, "usd": usd, "csv": csv, "parquet": parquet}
+    asked |= {"angles": angles, "mot": angles, "osim": osim, "urdf": urdf, "movement": movement, "fbx": fbx}
     formats = [name for name, wanted in asked.items() if wanted] or None
     settings = config.export
     if with_skin:
@@ -57,11 +63,15 @@ def export(
     opened = existing_run(run)
     with working(run, wait) if out is None else nullcontext(), progress_bars() as progress:
         tell_faults(opened)
-        exported = export_run(
-            opened, formats, settings, names=Names.read(names) if names else None, folder=out, progress=progress
-        )
+        exported = export_run(opened, formats, settings, folder=out, progress=progress)
+        written = list(exported.files.values())
+        if angles and exported.angles is not None and exported.angles.names:
+            picture = exported.files["angles"].with_suffix(".png")
+            write_bytes(picture, angle_sheet(exported.angles))
+            written.append(picture)
         if out is None:
-            opened.renew("export", exported.files.values())
+            named = [run / NAMES_FOUND] * (exported.found.template is not None)
+            opened.renew("export", [*written, *named])
     report_exported(exported)
     for gap in skeleton_gaps(read_skeleton(Run(run))):
         console.print(f"note: {gap}")
@@ -73,6 +83,10 @@ def report_exported(exported: Exported) -> None:
         console.print(f"{path}", markup=False)
     for reason in exported.skipped.values():
         console.print(f"not written: {reason}", markup=False)
+    found = exported.found
+    if found.template is not None:
+        sides = "" if found.sides_known else ", left and right not told: sides are a and b"
+        console.print(f"named as {found.template.name}: {len(found.bodies)} bodies, {len(found.joints)} joints{sides}")
     console.print(f"largest deviation from skeleton.npz: {exported.deviation_mm:.3f} mm")
     if exported.moving_joints:
         count = len(exported.moving_joints)

@@ -12,6 +12,31 @@ from geomocap.settings import Settings
 class ExportSettings(Settings):
     """What motion files hold, and in which units."""
 
+    names: str = Field(
+        "auto",
+        description="names of bodies and joints: auto (from the template that fits clearly, else numbers), none, a "
+        "template (human, quadruped, bird, hand, or a TOML file), or a file of your own names; RUN/names.toml goes "
+        "before found ones",
+        json_schema_extra={"flag": "names"},
+    )
+    name_set: Literal["plain", "opensim", "mixamo", "humanik", "coco"] = Field(
+        "plain", description="whose words names are in", json_schema_extra={"flag": "name-set"}
+    )
+    rest_pose: Literal["first", "T", "A"] = Field(
+        "first",
+        description="pose of a skeleton whose joints are not turned, in BVH, GLB and USD: the first frame, or a person "
+        "standing with arms to the sides (T) or half down (A), for retargeting",
+        json_schema_extra={"flag": "rest-pose"},
+    )
+    zero_frame: int | None = Field(
+        None,
+        ge=0,
+        description="frame in which all joint angles are zero; by default straight limbs have none",
+        json_schema_extra={"flag": "zero-frame"},
+    )
+    density: float = Field(
+        1000.0, gt=0, description="density that gives OpenSim's and URDF's bodies their mass (kg/m³)"
+    )
     joints: Literal["auto", "fixed", "moving"] = Field(
         "auto",
         description="fixed: constant offsets between joints; moving: every joint shifts in every frame; auto: only "

@@ -94,12 +94,12 @@ class _File:
             )
         return list(range(motion.n_nodes))
 
-    def add_skin(self, motion: MotionTree, joints: list[int], bind_frame: int) -> int:
-        R, p = motion.forward_kinematics()
+    def add_skin(self, motion: MotionTree, joints: list[int], bind_frame: int | None) -> int:
+        R, p = motion.bind_pose(bind_frame)
         inverse = np.tile(np.eye(4), (len(joints), 1, 1))
-        turned = R[bind_frame].swapaxes(-1, -2)
+        turned = R.swapaxes(-1, -2)
         inverse[:, :3, :3] = turned
-        inverse[:, :3, 3] = -np.einsum("nij,nj->ni", turned, p[bind_frame])
+        inverse[:, :3, 3] = -np.einsum("nij,nj->ni", turned, p)
         matrices = self.accessor(inverse.swapaxes(-1, -2).astype(np.float32))  # column major
         self.document.skins.append(gltf.Skin(joints=joints, skeleton=joints[0], inverseBindMatrices=matrices))
         return 0

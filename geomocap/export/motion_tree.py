@@ -93,6 +93,19 @@ class MotionTree:
         tree = Hierarchy(0, np.column_stack([self.parents[1:], np.arange(1, self.n_nodes)]))
         return tree.forward_kinematics(self.rotations, self.translations)
 
+    def bind_pose(self, frame: int | None) -> tuple[np.ndarray, np.ndarray]:
+        """World rotations (N, 3, 3) and origins (N, 3), metres, in a frame; None: at rest, where no node is turned."""
+        if frame is not None:
+            R, p = self.forward_kinematics()
+            return R[frame], p[frame]
+        still = replace(
+            self,
+            rotations=np.tile(np.eye(3), (1, self.n_nodes, 1, 1)),
+            translations=self.offsets[None].copy(),
+        )
+        R, p = still.forward_kinematics()
+        return R[0], p[0]
+
     def converted(self, convention: Convention) -> MotionTree:
         """Return the same motion in a file's axes and unit (lengths are no longer metres unless its unit is)."""
         return replace(

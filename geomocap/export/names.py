@@ -62,6 +62,18 @@ class Names:
         bodies = {**table.pop("bodies", {}), **table}
         return cls(_by_number(bodies, path, "body"), _by_number(joints, path, "joint"), str(path))
 
+    def over(self, bodies: Mapping[int, str], joints: Mapping[int, str]) -> Names:
+        """Return these names, and others for what they leave unnamed.
+
+        Parameters
+        ----------
+        bodies, joints : mapping of number to name
+            A name that is taken is left out.
+        """
+        more_bodies = {b: name for b, name in bodies.items() if name not in self.bodies.values()}
+        more_joints = {j: name for j, name in joints.items() if name not in self.joints.values()}
+        return Names({**more_bodies, **self.bodies}, {**more_joints, **self.joints}, self.source)
+
     def body_names(self, n: int, found: Sequence[str] | np.ndarray | None = None) -> tuple[str, ...]:
         """Return the names of `n` bodies: the user's, or the found ones, or `body00` …"""
         self._check(self.bodies, n, "body", "bodies")

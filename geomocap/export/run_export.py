@@ -5,30 +5,41 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from geomocap.angles.angle_set import AngleSet
 from geomocap.errors import RunError
+from geomocap.export.angle_files import angle_table, run_angles, write_mot
 from geomocap.export.bvh import write_bvh
 from geomocap.export.c3d import write_c3d
-from geomocap.export.conventions import Axis
+from geomocap.export.conventions import Axis, Convention
 from geomocap.export.export_errors import MissingPackageError, MotionError
 from geomocap.export.export_settings import ExportSettings
+from geomocap.export.fbx import write_fbx
 from geomocap.export.glb import write_glb
+from geomocap.export.linked_bodies import LinkedBodies, linked_bodies
 from geomocap.export.markers import Markers, markers_from_run
 from geomocap.export.model_skin import skin_from_model
 from geomocap.export.motion_tree import MotionTree
+from geomocap.export.movement_dataset import write_movement
 from geomocap.export.names import Names
+from geomocap.export.osim import OSIM, write_osim
+from geomocap.export.rest_pose import at_rest
+from geomocap.export.run_names import NAMES_FOUND, names_text, run_names
 from geomocap.export.skeleton_motion import UNKNOWN_RADIUS, motion_from_skeleton
 from geomocap.export.skin import skin_from_run
 from geomocap.export.skinned_mesh import SkinnedMesh
 from geomocap.export.tables import motion_table, write_csv, write_parquet
 from geomocap.export.trc import write_trc
+from geomocap.export.urdf import URDF, write_urdf
 from geomocap.export.usd import write_usd
-from geomocap.files.atomic import remove_remains
+from geomocap.files.atomic import remove_remains, write_text
 from geomocap.files.results import ELLIPSOIDS, KEYPOINTS, read_ellipsoids, read_keypoint_paths, read_skeleton
 from geomocap.files.run import Run
 from geomocap.model.skeleton import Skeleton
+from geomocap.naming.found_names import FoundNames
 from geomocap.progress import Progress, silent
 from geomocap.settings import check_settings
 from geomocap.subject.subject_model import MODEL_FILE, read_model
@@ -41,7 +52,14 @@ FILES = {
     "usd": "motion.usdc",
     "csv": "motion.csv",
     "parquet": "motion.parquet",
+    "angles": "angles.csv",
+    "mot": "angles.mot",
+    "osim": "motion.osim",
+    "urdf": "motion.urdf",
+    "movement": "motion.nc",
+    "fbx": "motion.fbx",
 }
+ON_REQUEST = ("osim", "urdf", "movement", "fbx")  # formats that are not written unless asked for
 
 
 @dataclass(frozen=True)
@@ -57,12 +75,18 @@ class Exported:
         Largest distance of the files' joints from those of `skeleton.npz`.
     moving_joints : tuple of str
         Nodes that shift against their parents, because their joints are not fixed in the bodies.
+    found : FoundNames
+        Names from a template.
+    angles : AngleSet or None
+        Of all joints.
     """
 
     files: dict[str, Path]
     skipped: dict[str, str] = field(default_factory=dict)
     deviation_mm: float = 0.0
     moving_joints: tuple[str, ...] = ()
+    found: FoundNames = field(default_factory=FoundNames)
+    angles: AngleSet | None = None
 
 
 def export_run(
@@ -81,11 +105,11 @@ def export_run(
     run : Run
         With `skeleton.npz`.
     formats : sequence of str, optional
-        Of bvh, trc, c3d, glb, usd, csv, parquet. By default all whose packages are installed.
+        Of those in `FILES`. By default all whose packages are installed but those `ON_REQUEST`.
     settings : ExportSettings, optional
         By default those of the run.
     names : Names, optional
-        The user's names; by default those of `RUN/names.toml` if it is there.
+        The user's names; by default those that `settings.names` asks for.
     folder : Path, optional
         Where to write; by default the run.
     progress : Progress
@@ -104,16 +128,32 @@ def export_run(
     if unknown:
         raise MotionError(f"{unknown[0]}: no motion format; expected one of {', '.join(FILES)}")
     skeleton = read_skeleton(run)
-    if names is None and (run.path / "names.toml").is_file():
-        names = Names.read(run.path / "names.toml")
     up = run_up(run)
+    names, found = (names, FoundNames()) if names is not None else run_names(run, skeleton, up, settings)
     motion = motion_from_skeleton(skeleton, up=up, names=names, joints=settings.joints, radius=mean_radius(run))
     markers = run_markers(run, skeleton, names, up, ellipsoids=settings.ellipsoids)
     mesh = surface_of_run(run, motion, settings)
-    writers = _writers(motion, markers, mesh, settings)
+    shown, skinned = at_rest(motion, mesh, found, settings.rest_pose)
+
+    def links(convention: Convention) -> LinkedBodies:
+        fixed = motion_from_skeleton(skeleton, up=up, names=names, joints="fixed", radius=mean_radius(run))
+        bodies = (names or Names()).body_names(skeleton.body_count, skeleton.body_names)
+        labels = (names or Names()).joint_names(skeleton.joint_bodies, bodies, skeleton.joint_names)
+        density, radius = settings.density, mean_radius(run)
+        return linked_bodies(fixed, mesh, labels, convention, density=density, radius=radius)
+
+    angles = run_angles(run, skeleton, names, found, settings)
+    writers = _writers(motion, markers, shown, skinned, settings) | {
+        "angles": lambda path: write_csv(path, angle_table(angles)),
+        "mot": lambda path: write_mot(path, angles),
+        "osim": lambda path: write_osim(path, links(OSIM)),
+        "urdf": lambda path: write_urdf(path, links(URDF)),
+        "fbx": lambda path: _write_fbx(path, shown, skinned),
+        "movement": lambda path: write_movement(path, markers),
+    }
     remove_remains([folder or run.path])
     files, skipped = {}, {}
-    chosen = list(formats) if formats is not None else list(FILES)
+    chosen = list(formats) if formats is not None else [name for name in FILES if name not in ON_REQUEST]
     for k, name in enumerate(chosen):
         path = (folder or run.path) / FILES[name]
         try:
@@ -124,8 +164,10 @@ def export_run(
                 raise
             skipped[name] = str(error)
         progress("export", k + 1, len(chosen))
+    if found.template is not None:
+        write_text((folder or run.path) / NAMES_FOUND, names_text(found))
     shifting = tuple(n for n, m, j in zip(motion.names, motion.moving, motion.joints, strict=True) if m and j >= 0)
-    return Exported(files, skipped, motion.largest_deviation_mm(skeleton.joint_positions), shifting)
+    return Exported(files, skipped, motion.largest_deviation_mm(skeleton.joint_positions), shifting, found, angles)
 
 
 def run_settings(run: Run) -> ExportSettings:
@@ -168,15 +210,22 @@ def surface_of_run(run: Run, motion: MotionTree, settings: ExportSettings) -> Sk
     return skin_from_run(run, motion, settings) if settings.surface == "skin" else None
 
 
+def _write_fbx(path: Path, motion: MotionTree, mesh: SkinnedMesh | None) -> None:
+    with TemporaryDirectory() as folder:
+        glb = Path(folder) / FILES["glb"]
+        write_glb(glb, motion, mesh)
+        write_fbx(path, glb, motion.fps)
+
+
 def _writers(
-    motion: MotionTree, markers: Markers, mesh: SkinnedMesh | None, settings: ExportSettings
+    motion: MotionTree, markers: Markers, shown: MotionTree, mesh: SkinnedMesh | None, settings: ExportSettings
 ) -> dict[str, Callable[[Path], None]]:
     return {
-        "bvh": lambda path: write_bvh(path, motion, unit=settings.bvh_unit),
+        "bvh": lambda path: write_bvh(path, shown, unit=settings.bvh_unit),
         "trc": lambda path: write_trc(path, markers, unit=settings.trc_unit),
         "c3d": lambda path: write_c3d(path, markers, motion),
-        "glb": lambda path: write_glb(path, motion, mesh),
-        "usd": lambda path: write_usd(path, motion, mesh),
+        "glb": lambda path: write_glb(path, shown, mesh),
+        "usd": lambda path: write_usd(path, shown, mesh),
         "csv": lambda path: write_csv(path, motion_table(markers, motion)),
         "parquet": lambda path: write_parquet(path, motion_table(markers, motion)),
     }

@@ -28,8 +28,8 @@ class SkinnedMesh:
         Nodes of the motion.
     weights : (V, 4) float
         They sum to one.
-    bind_frame : int
-        Frame of the motion in whose pose the vertices are.
+    bind_frame : int or None
+        Frame of the motion in whose pose the vertices are; None: that in which no node is turned.
     """
 
     vertices: np.ndarray
@@ -38,7 +38,7 @@ class SkinnedMesh:
     colors: np.ndarray
     nodes: np.ndarray
     weights: np.ndarray
-    bind_frame: int = 0
+    bind_frame: int | None = 0
 
     def __post_init__(self) -> None:
         v = len(self.vertices)
@@ -53,7 +53,7 @@ class SkinnedMesh:
         """Vertices in every frame of the motion: (T, V, 3) metres, world."""
         R, p = motion.forward_kinematics()
         # Vertices in the axes of the nodes that carry them, as they were bound.
-        bound_R, bound_p = R[self.bind_frame], p[self.bind_frame]
+        bound_R, bound_p = motion.bind_pose(self.bind_frame)
         local = np.einsum("vkji,vkj->vki", bound_R[self.nodes], self.vertices[:, None] - bound_p[self.nodes])
         posed = np.empty((motion.n_frames, len(self.vertices), 3))
         for t in range(motion.n_frames):

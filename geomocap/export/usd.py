@@ -83,13 +83,13 @@ def _matrices(rotations: np.ndarray, positions: np.ndarray) -> Any:
     return Vt.Matrix4dArray.FromNumpy(matrices)
 
 
-def _add_skeleton(stage: Any, motion: MotionTree, joints: list[str], bind_frame: int) -> None:
+def _add_skeleton(stage: Any, motion: MotionTree, joints: list[str], bind_frame: int | None) -> None:
     from pxr import UsdSkel
 
-    R, p = motion.forward_kinematics()
+    R, p = motion.bind_pose(bind_frame)
     skeleton = UsdSkel.Skeleton.Define(stage, SKELETON)
     skeleton.CreateJointsAttr(joints)
-    skeleton.CreateBindTransformsAttr(_matrices(R[bind_frame], p[bind_frame]))
+    skeleton.CreateBindTransformsAttr(_matrices(R, p))
     skeleton.CreateRestTransformsAttr(_matrices(motion.rotations[0], motion.translations[0]))
     binding = UsdSkel.BindingAPI.Apply(skeleton.GetPrim())
     binding.CreateAnimationSourceRel().SetTargets([ANIMATION])

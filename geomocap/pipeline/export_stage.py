@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from geomocap.export.run_export import FILES, export_run
+from geomocap.export.run_names import NAMES_FOUND
 from geomocap.files.atomic import fingerprint
 from geomocap.files.run import stage_key
 from geomocap.pipeline.check_stage import check
@@ -18,7 +21,9 @@ def motion_files(job: Job, source: Source) -> str:
     if not (job.run.path / "skeleton.npz").exists():
         return segmented
     check(job, segmented)
-    beside = fingerprint(job.run.path / name for name in ("names.toml", "keypoints.npz"))
+    named = Path(job.config.export.names)
+    files = [job.run.path / name for name in ("names.toml", "keypoints.npz")] + [named] * named.is_file()
+    beside = fingerprint(files)
     key = stage_key(__name__, "export", segmented, job.config.export.model_dump(), job.up, beside)
 
     def work() -> int:
@@ -26,4 +31,4 @@ def motion_files(job: Job, source: Source) -> str:
         return len(written.files)
 
     always = [FILES["bvh"], FILES["trc"], FILES["glb"]]
-    return job.stage("export", key, always, work, [f for f in FILES.values() if f not in always])
+    return job.stage("export", key, always, work, [*(f for f in FILES.values() if f not in always), NAMES_FOUND])

@@ -1,0 +1,97 @@
+"""A pose in which a skeleton counts as not turned: a person standing with the arms out, as retargeting tools expect."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from geomocap.export.export_errors import MotionError
+from geomocap.export.motion_tree import MotionTree
+from geomocap.export.skinned_mesh import SkinnedMesh
+from geomocap.naming.found_names import FoundNames
+
+# where bones point, in forward, left and up, of the left side; A: arms half down
+TRUNK = ("thorax", "head")
+ARM = ("upper_arm", "forearm", "hand")
+LEG = ("thigh", "shank")
+ARMS_OUT = {"T": np.array([0.0, 1.0, 0.0]), "A": np.array([0.0, 1.0, -1.0]) / np.sqrt(2)}
+
+
+def at_rest(
+    motion: MotionTree, mesh: SkinnedMesh | None, found: FoundNames, pose: Literal["first", "T", "A"]
+) -> tuple[MotionTree, SkinnedMesh | None]:
+    """Return a motion whose nodes are not turned in a pose, and its mesh bound in that pose.
+
+    The motion itself stays the same. Bones of parts without a name keep their place on their parents.
+
+    Parameters
+    ----------
+    motion : MotionTree
+        Not turned in the first frame.
+    mesh : SkinnedMesh, optional
+    found : FoundNames
+    pose : "first", "T" or "A"
+
+    Raises
+    ------
+    MotionError
+        If the pose is that of a person, and the subject wasn't named as one with left and right.
+    """
+    if pose == "first":
+        return motion, mesh
+    turns = _turns(motion, found, ARMS_OUT[pose])
+    parents = motion.parents
+    before = np.where((parents >= 0)[:, None, None], turns[parents], np.eye(3))
+    rested = replace(
+        motion,
+        rotations=before @ motion.rotations @ turns.swapaxes(1, 2),
+        translations=np.einsum("nij,tnj->tni", before, motion.translations),
+        offsets=np.einsum("nij,nj->ni", before, motion.offsets),
+        tips=np.einsum("nij,nj->ni", turns, motion.tips),
+    )
+    return rested, None if mesh is None else rebound(mesh, rested)
+
+
+def rebound(mesh: SkinnedMesh, motion: MotionTree) -> SkinnedMesh:
+    """Return a mesh bound where no node of its motion is turned."""
+    R, p = motion.bind_pose(mesh.bind_frame)
+    _, rest = motion.bind_pose(None)
+    local = np.einsum("vkji,vkj->vki", R[mesh.nodes], mesh.vertices[:, None] - p[mesh.nodes])
+    vertices = np.einsum("vk,vki->vi", mesh.weights, local + rest[mesh.nodes])
+    normals = np.einsum("vk,vkji,vj->vi", mesh.weights, R[mesh.nodes], mesh.normals)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(length > 1e-9, normals / np.maximum(length, 1e-9), mesh.normals)
+    return replace(mesh, vertices=vertices, normals=normals, bind_frame=None)
+
+
+def _turns(motion: MotionTree, found: FoundNames, arm: np.ndarray) -> np.ndarray:
+    """Turns (N, 3, 3) of the nodes from the first frame to the pose, in the world's axes."""
+    template = found.template
+    if template is None or template.name != "human" or found.from_world is None:
+        raise MotionError(
+            "rest pose T or A: the subject is not named as a person with left and right (--names human, or names.toml)"
+        )
+    turns = np.tile(np.eye(3), (motion.n_nodes, 1, 1))
+    for n in range(1, motion.n_nodes):
+        turns[n] = turns[motion.parents[n]]
+        part = found.joint_parts.get(int(motion.joints[n]))
+        if part is None or part not in found.parts.get(int(motion.bodies[n]), ()):
+            continue
+        name, side = template.parts[part], template.sides[part]
+        mirror = np.array([1.0, -1.0 if side == "right" else 1.0, 1.0])
+        wanted = arm * mirror if name in ARM else np.array([0, 0, 1.0]) if name in TRUNK else np.array([0, 0, -1.0])
+        bone = turns[n] @ _bone(motion, n)
+        if name in (*ARM, *TRUNK, *LEG) and np.linalg.norm(bone) > 1e-6:
+            target = wanted @ found.from_world
+            least, _ = Rotation.align_vectors(target[None], bone[None])
+            turns[n] = least.as_matrix() @ turns[n]
+    return turns
+
+
+def _bone(motion: MotionTree, node: int) -> np.ndarray:
+    """From a node's joint to the next along its limb, or to its end, (3,) in its axes; the mean of several."""
+    children = motion.children(node)
+    return motion.offsets[children].mean(axis=0) if children else motion.tips[node]

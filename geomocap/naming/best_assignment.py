@@ -1,0 +1,60 @@
+"""The heaviest set of choices of which no two exclude each other: branch and bound on sets of bits."""
+
+from __future__ import annotations
+
+import numpy as np
+
+MOST_NODES = 3_000  # of the search; the best found so far is returned then
+
+
+def heaviest_choices(
+    weights: np.ndarray, groups: np.ndarray, kinds: np.ndarray, excluded: np.ndarray, above: float = -np.inf
+) -> list[int] | None:
+    """Choose at most one of each group and of each kind, none excluding another, with the greatest sum of weights.
+
+    Parameters
+    ----------
+    weights : (N,) float
+        Positive.
+    groups, kinds : (N,) int
+    excluded : (N, N) bool
+        Symmetric; choices of one group or kind exclude each other whatever it says.
+    above : float
+        Only sums above are looked for.
+
+    Returns
+    -------
+    list of int or None
+        None: no sum is above.
+    """
+    order = np.argsort(-weights, kind="stable")
+    value = weights[order].tolist()
+    apart = excluded | (groups[:, None] == groups) | (kinds[:, None] == kinds)
+    allowed = [_bits(row) for row in ~apart[np.ix_(order, order)]]
+    of_group = [_bits(groups[order] == g) for g in np.unique(groups)]
+    of_kind = [_bits(kinds[order] == k) for k in np.unique(kinds)]
+    best: tuple[float, list[int] | None] = (above, None)
+    stack: list[tuple[int, float, list[int]]] = [((1 << len(value)) - 1, 0.0, [])]
+    nodes = 0
+    while stack and nodes < MOST_NODES:
+        nodes += 1
+        left, total, taken = stack.pop()
+        if total > best[0] + 1e-12:
+            best = total, taken
+        if not left:
+            continue
+        room = min(sum(value[_first(left & s)] for s in sets if left & s) for sets in (of_group, of_kind))
+        if total + room <= best[0] + 1e-12:
+            continue
+        first = _first(left)
+        stack.append((left & ~(1 << first), total, taken))
+        stack.append((left & allowed[first], total + value[first], [*taken, first]))
+    return None if best[1] is None else [int(order[i]) for i in best[1]]
+
+
+def _bits(mask: np.ndarray) -> int:
+    return int.from_bytes(np.packbits(mask, bitorder="little").tobytes(), "little")
+
+
+def _first(bits: int) -> int:
+    return (bits & -bits).bit_length() - 1

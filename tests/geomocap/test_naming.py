@@ -1,0 +1,217 @@
+from itertools import product
+
+import numpy as np
+import pytest
+
+from geomocap.export.export_errors import MotionError
+from geomocap.export.export_settings import ExportSettings
+from geomocap.export.rest_pose import at_rest
+from geomocap.export.run_export import export_run
+from geomocap.export.skeleton_motion import motion_from_skeleton
+from geomocap.export.skinned_mesh import bone_mesh
+from geomocap.export.trc import read_trc
+from geomocap.files.run import Run
+from geomocap.model.skeleton import Skeleton
+from geomocap.naming.best_assignment import heaviest_choices
+from geomocap.naming.found_names import find_names
+from geomocap.naming.name_sets import renamed
+from geomocap.naming.name_templates import NamingError, built_in_templates, read_template
+from geomocap.naming.tree_features import nesting
+from tests.geomocap.articulated import skeleton_arrays, skeleton_of
+from tests.geomocap.template_figures import figure
+
+HUMAN, QUADRUPED, BIRD = (read_template(name) for name in ("human", "quadruped", "bird"))
+
+
+def test_heaviest_choices_are_those_of_trying_all():
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        n = 9
+        weights, groups, kinds = rng.uniform(0.1, 2, n), rng.integers(0, 4, n), rng.integers(0, 4, n)
+        excluded = rng.random((n, n)) < 0.2
+        excluded |= excluded.T
+        apart = excluded | (groups[:, None] == groups) | (kinds[:, None] == kinds)
+        best = 0.0
+        for bits in product([False, True], repeat=n):
+            taken = np.flatnonzero(bits)
+            if not (apart[np.ix_(taken, taken)] & ~np.eye(len(taken), dtype=bool)).any():
+                best = max(best, float(weights[taken].sum()))
+        chosen = heaviest_choices(weights, groups, kinds, excluded)
+        assert chosen is not None
+        assert weights[chosen].sum() == pytest.approx(best)
+        assert heaviest_choices(weights, groups, kinds, excluded, above=best) is None
+
+
+def test_nesting_of_sets():
+    sets = np.array([[1, 1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 1, 1, 0]], bool)
+    assert nesting(sets, sets)[0].tolist() == [1, 2, 0, 3]
+    assert nesting(sets, sets)[1, 0] == 1
+
+
+@pytest.mark.parametrize("template", [HUMAN, QUADRUPED, BIRD], ids=lambda t: t.name)
+@pytest.mark.parametrize("turn", [0.0, 2.2])
+def test_a_figure_of_a_template_gets_its_names(template, turn):
+    skeleton, labels = figure(template, turn=turn)
+    found = find_names(skeleton, 2)
+    assert found.template is not None
+    assert found.template.name == template.name
+    assert found.sides_known
+    assert [found.bodies.get(b) for b in range(len(labels))] == labels
+    assert found.from_world is not None
+    assert found.from_world[0] @ [np.cos(turn), np.sin(turn), 0] > 0.9
+
+
+def test_left_and_right_follow_the_heading_not_the_order_of_bodies():
+    skeleton, labels = figure(HUMAN, mirrored=True)
+    found = find_names(skeleton, 2)
+    other = {"left": "right", "right": "left"}
+    expected = [f"{s[: s.rindex('_')]}_{other[s.rsplit('_')[-1]]}" if s.rsplit("_")[-1] in other else s for s in labels]
+    assert [found.bodies.get(b) for b in range(len(labels))] == expected
+
+
+def test_the_way_names_are_found_does_not_depend_on_the_axis_that_points_up():
+    skeleton, labels = figure(HUMAN)
+    turned = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # z up to y up
+    arrays = {
+        "joint_positions": skeleton.joint_positions @ turned.T,
+        "body_positions": skeleton.body_positions @ turned.T,
+        "body_rotations": turned @ skeleton.body_rotations @ turned.T,
+        "offsets": skeleton.offsets @ turned.T,
+        "body_offsets": skeleton.body_offsets @ turned.T,
+    }
+    plain = {
+        k: getattr(skeleton, k) for k in ("joint_bodies", "joint_names", "body_names", "root", "fixed_joints", "fps")
+    }
+    found = find_names(Skeleton(**arrays, **plain), 1)
+    assert [found.bodies.get(b) for b in range(len(labels))] == labels
+
+
+def test_a_body_that_holds_two_parts_is_called_after_both():
+    gone = [("hand", "left"), ("foot", "left"), ("foot", "right"), ("thorax", "")]
+    skeleton, labels = figure(HUMAN, without=gone)
+    found = find_names(skeleton, 2, templates=[HUMAN])
+    names = dict(zip(labels, (found.bodies.get(b) for b in range(len(labels))), strict=True))
+    assert names["forearm_left"] == "forearm_hand_left"
+    assert names["forearm_right"] == "forearm_right"
+    assert names["shank_right"] == "shank_foot_right"
+    assert names["pelvis"] == "trunk"
+
+
+def test_a_tree_of_nothing_known_keeps_its_numbers():
+    named = [find_names(skeleton_of(skeleton_arrays(8, seed=seed)), 2).bodies for seed in range(12)]
+    assert named == [{}] * 12
+
+
+def test_a_users_own_template_whose_ends_look_alike_tells_no_left_from_right(tmp_path):
+    leg = "pair = true\nparent = 'top'\nsurface = 1\nmobility = 0.2\n"
+    (tmp_path / "table.toml").write_text(
+        "[parts.top]\ncenter = [0, 0, 1]\nsurface = 6\n"
+        f"[parts.leg]\n{leg}joint = [0.5, 0.3, 1]\ncenter = [0.5, 0.3, 0.5]\ntip = [0.5, 0.3, 0]\n"
+        f"[parts.prop]\n{leg}joint = [-0.5, 0.3, 1]\ncenter = [-0.5, 0.3, 0.5]\ntip = [-0.5, 0.3, 0]\n"
+    )
+    table = read_template(tmp_path / "table.toml")
+    found = find_names(figure(table, speed=0.0)[0], 2, templates=[table])
+    assert found.bodies[0] == "top"
+    assert not found.sides_known
+    assert not any(name.endswith(("_left", "_right")) for name in found.bodies.values())
+
+
+def test_names_of_other_programs():
+    found = find_names(figure(HUMAN)[0], 2)
+    assert set(renamed(found, "mixamo").bodies.values()) > {"mixamorig:Hips", "mixamorig:LeftForeArm"}
+    assert set(renamed(found, "opensim").bodies.values()) > {"pelvis", "femur_l", "tibia_r", "calcn_l"}
+    assert set(renamed(found, "coco").joints.values()) > {"left_knee", "right_wrist"}
+    assert set(renamed(found, "humanik").bodies.values()) > {"Hips", "RightUpLeg"}
+
+
+def test_every_template_can_be_read_and_a_wrong_one_says_why(tmp_path):
+    assert built_in_templates() == ["bird", "hand", "human", "quadruped"]
+    for name in built_in_templates():
+        template = read_template(name)
+        assert template.surfaces.sum() == pytest.approx(1)
+        assert (template.mirrored[template.mirrored] == np.arange(len(template.parts))).all()
+    file = tmp_path / "worm.toml"
+    for text, told in [
+        ("parts = 3", "no parts"),
+        ("[parts.a]\nsurface = 1", "center"),
+        ("[parts.a]\ncenter = [0, 0, 0]", "surface"),
+        ('[parts.a]\ncenter = [0, 0, 0]\nsurface = 1\n[parts.b]\nparent = "c"', "parent"),
+        ("[parts.a]\ncolour = 1", "colour"),
+        ("[parts", "TOML"),
+    ]:
+        file.write_text(text)
+        with pytest.raises(NamingError, match=told):
+            read_template(file)
+    with pytest.raises(NamingError, match="no such template"):
+        read_template("snail")
+
+
+@pytest.fixture
+def run(tmp_path):
+    skeleton, _ = figure(HUMAN)
+    run = Run(tmp_path / "run")
+    names = ("joint_positions", "joint_bodies", "joint_names", "body_rotations", "body_positions")
+    run.write_npz("skeleton.npz", **{n: getattr(skeleton, n) for n in names}, fps=np.array(30.0))
+    run.write_record({"source": {"up": "z"}})
+    return run
+
+
+def test_motion_files_hold_the_names_and_a_list_says_how_sure_they_are(run):
+    exported = export_run(run, ["trc"])
+    assert exported.found.sides_known
+    assert {"knee_left", "elbow_right", "neck"} <= set(read_trc(exported.files["trc"]).names)
+    assert '"thigh_left" = ' in (run.path / "names_found.toml").read_text()
+
+
+def test_the_users_names_go_first_and_none_means_numbers(run, tmp_path):
+    (run.path / "names.toml").write_text("mine = 1\n[joints]\nknee_left = 0\n")
+    names = read_trc(export_run(run, ["trc"]).files["trc"]).names
+    assert names[0] == "knee_left"
+    assert len(set(names)) == len(names)
+    plain = export_run(run, ["trc"], ExportSettings(names="none"), folder=tmp_path / "none")
+    assert plain.found.template is None
+    assert "neck" not in read_trc(plain.files["trc"]).names
+    assert not (tmp_path / "none" / "names_found.toml").exists()
+    with pytest.raises(NamingError, match="snail"):
+        export_run(run, ["trc"], ExportSettings(names="snail"))
+
+
+@pytest.mark.parametrize("pose", ["T", "A"])
+def test_a_rest_pose_changes_the_skeleton_but_not_the_motion(pose):
+    skeleton, labels = figure(HUMAN, turn=0.7)
+    found = find_names(skeleton, 2)
+    motion = motion_from_skeleton(skeleton)
+    mesh = bone_mesh(motion)
+    rested, bound = at_rest(motion, mesh, found, pose)
+    assert rested.largest_deviation_mm(skeleton.joint_positions) < 1e-6
+    assert bound is not None
+    assert bound.bind_frame is None
+    assert np.abs(bound.posed(rested) - mesh.posed(motion)).max() < 1e-9
+    R, p = rested.bind_pose(None)
+    assert np.abs(R - np.eye(3)).max() == 0
+    place = {labels[b]: p[n] for n, b in enumerate(rested.bodies)}
+    left = np.array([-np.sin(0.7), np.cos(0.7), 0])
+    along = place["hand_left"] - place["upper_arm_left"]
+    wanted = left if pose == "T" else (left - [0, 0, 1]) / np.sqrt(2)
+    assert along @ wanted > 0.98 * np.linalg.norm(along)
+    leg = place["foot_right"] - place["thigh_right"]
+    assert leg[2] < -0.99 * np.linalg.norm(leg)
+
+
+def test_a_rest_pose_of_a_person_needs_a_person():
+    skeleton, _ = figure(QUADRUPED)
+    with pytest.raises(MotionError, match="rest pose"):
+        at_rest(motion_from_skeleton(skeleton), None, find_names(skeleton, 2), "T")
+
+
+@pytest.mark.parametrize("what", ["one body", "one frame", "no joints", "all in one place", "no rotation", "many"])
+def test_subjects_of_which_little_is_known_keep_their_numbers(what):
+    arrays = skeleton_arrays({"one body": 1, "many": 30}.get(what, 6), 1 if what == "one frame" else 10)
+    if what == "no joints":
+        arrays["joint_positions"][:] = np.nan
+    if what == "all in one place":
+        arrays["joint_positions"][:] = 0
+        arrays["body_positions"][:] = 0
+    if what == "no rotation":
+        arrays["body_rotations"][:, 3] = np.nan
+    assert find_names(skeleton_of(arrays), 2).bodies == {}

@@ -1,0 +1,48 @@
+"""Joint angles over time, each with its band of confidence."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from geomocap.angles.angle_set import AngleSet
+from viz.body_colors import body_color, hex_color
+from viz.figures import WIDTH, figure_of, plot
+
+COLUMNS = 3
+MIDDLE = {"left": 0, "right": 1, "a": 0, "b": 1}
+
+
+@plot
+def angle_sheet(angles: AngleSet) -> Figure:
+    """Plot all angles, those of the two sides in one field; the band is twice the standard deviation.
+
+    The size of what turns about other axes than a joint's own isn't drawn.
+    """
+    fields: dict[str, list[int]] = {}
+    for k, name in enumerate(angles.names):
+        if not name.endswith("_off_axis"):
+            words = [w for w in name.split("_") if w not in MIDDLE]
+            fields.setdefault(" ".join(words), []).append(k)
+    rows = max(1, -(-len(fields) // COLUMNS))
+    figure = figure_of(WIDTH, 1.5 * rows + 0.3)
+    axes = np.atleast_1d(figure.subplots(rows, COLUMNS, sharex=True, squeeze=False)).ravel()
+    times = np.arange(len(angles.values)) / angles.fps
+    for ax, (title, numbers) in zip(axes, fields.items(), strict=False):
+        for k in numbers:
+            side = next((w for w in angles.names[k].split("_") if w in MIDDLE), "")
+            color = hex_color(body_color(MIDDLE.get(side, 2)))
+            value, band = angles.values[:, k], 2 * np.nan_to_num(angles.std[:, k])
+            ax.fill_between(times, value - band, value + band, color=color, alpha=0.25, lw=0)
+            ax.plot(times, value, color=color, label=side or None)
+        ax.set_title(title)
+        if len(numbers) > 1:
+            ax.legend(fontsize=7, loc="upper right")
+    for ax in axes[len(fields) :]:
+        ax.set_visible(False)
+    for ax in axes[max(0, len(fields) - COLUMNS) : len(fields)]:
+        ax.tick_params(labelbottom=True)
+        ax.set_xlabel("time (s)")
+    for ax in axes[::COLUMNS]:
+        ax.set_ylabel("degrees")
+    return figure
