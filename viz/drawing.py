@@ -18,6 +18,9 @@ from viz.body_colors import INK
 FAINT = (118, 124, 133)
 """Secondary text, RGB 0–255."""
 
+DENSITY = 1
+"""Pixels of a picture along a pixel of the page that shows it."""
+
 GAP = 8
 """Pixels between the pictures of a sheet."""
 
@@ -182,4 +185,11 @@ def jpeg(image: np.ndarray, quality: int = 88) -> bytes:
     """Return an image (H, W, 3) uint8 RGB as the bytes of a JPEG without colour subsampling."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "JPEG", quality=quality, subsampling=0, optimize=True)
+    return buffer.getvalue()
+
+
+def webp(image: np.ndarray, quality: int = 80) -> bytes:
+    """Return an image (H, W, 3) uint8 RGB, or (H, W, 4) with opacity, as the bytes of a WebP picture."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "WEBP", quality=quality, method=4)
     return buffer.getvalue()

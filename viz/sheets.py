@@ -93,6 +93,13 @@ def geometry_sheet(
     return sheet([list(row) for row in zip(*columns, strict=True)], views, labels)
 
 
+def still(results: Results, stage: ViewStage, frame: int, size: tuple[int, int] = (1600, 1000)) -> np.ndarray:
+    """Return one picture of the skeleton inside the translucent volume, where nothing can be turned."""
+    azimuth, elevation = VIEWS["three-quarter"]
+    model = Model(skeleton_meshes(results, frame))
+    return picture(results, stage, model, stage.view(azimuth, elevation, size), frame, Look(samples=1))
+
+
 def path_sheet(results: Results, stage: ViewStage, frame: int) -> np.ndarray:
     """Return the paths of the whole sequence, views beside each other, with the volume of one frame as glass."""
     model = Model(path_meshes(results, frame))
