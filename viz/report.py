@@ -21,6 +21,9 @@ from viz.turntable import Turntable
 EMBEDDED_VIDEO = 6_000_000
 """Videos up to this many bytes go into the page; larger ones are linked beside it."""
 
+LARGE_PLOT = 80_000
+"""Plots of more bytes are embedded with a small loss."""
+
 
 @dataclass(frozen=True)
 class Block:
@@ -33,6 +36,7 @@ class Block:
     width: int = 0
     height: int = 0
     look: Literal["sheet", "plot"] = "sheet"
+    folded: bool = False
     items: tuple[str, ...] = ()
     head: tuple[str, ...] = ()
     rows: tuple[tuple[str, ...], ...] = ()
@@ -78,12 +82,16 @@ def picture(image: np.ndarray, title: str, words: str) -> Block:
 
 
 def plot(png: bytes, title: str, words: str) -> Block:
-    """Return a plot with a caption, embedded as WebP without loss."""
+    """Return a plot with a caption, embedded as WebP, without loss where that is small."""
     with Image.open(io.BytesIO(png)) as drawn:
-        data = io.BytesIO()
-        drawn.convert("RGB").save(data, "WEBP", lossless=True, quality=50, method=3)
-        width, height = drawn.size
-    source = _data_uri("image/webp", data.getvalue())
+        image = drawn.convert("RGB")
+    width, height = image.size
+    exact = io.BytesIO()
+    image.save(exact, "WEBP", lossless=True, quality=40, method=2)
+    data = exact.getvalue()
+    if len(data) > LARGE_PLOT:
+        data = min(data, webp(np.asarray(image), 82), key=len)
+    source = _data_uri("image/webp", data)
     return Block("picture", words, title, source, round(width / DENSITY), round(height / DENSITY), look="plot")
 
 
@@ -92,11 +100,14 @@ def turning(still: np.ndarray | None, title: str, words: str) -> Block:
     return Block("turntable", words, title, "" if still is None else _data_uri("image/webp", webp(still)))
 
 
-def video(file: Path, title: str, words: str) -> Block:
-    """Return a video with a caption: embedded if it is small, otherwise linked by its name beside the page."""
+def video(file: Path, title: str, words: str, folded: bool = False) -> Block:
+    """Return a video with a caption: embedded if it is small, otherwise linked by its name beside the page.
+
+    Folded, a line stands for it until the reader opens it.
+    """
     small = file.stat().st_size <= EMBEDDED_VIDEO
     source = _data_uri("video/mp4", file.read_bytes()) if small else file.name
-    return Block("video", words, title, source)
+    return Block("video", words, title, source, folded=folded)
 
 
 def table(

@@ -148,7 +148,8 @@ def _result(
         desk.written.append(path)
         over = ", and over the image of one camera" if _calibrated(results) else ""
         words = "Look for limbs that keep their colour, joints that stay inside the volume, and bones that don't jump."
-        blocks.append(video(path, "The motion", f"From a slowly turning free view{over}. {words}"))
+        told = f"From a slowly turning free view{over}. {words}"
+        blocks.append(video(path, "The motion", told, folded=turns is not None))
     desk.step()
     rows: list[tuple[str, sheets.Builder]] = []
     if {"voxels", "cloud"} & set(results.kinds):

@@ -1,4 +1,4 @@
-"""A headless Chromium that draws in software, driven by its own protocol (Chrome DevTools Protocol over a web socket)."""
+"""A headless Chromium that draws in software, driven by its own protocol over a web socket."""
 
 from __future__ import annotations
 
@@ -104,7 +104,8 @@ class Page:
 
     def box(self, selector: str) -> tuple[float, float, float, float]:
         """Return x, y, width and height of an element in the window."""
-        script = f"(r => [r.x, r.y, r.width, r.height])(document.querySelector({json.dumps(selector)}).getBoundingClientRect())"
+        found = f"document.querySelector({json.dumps(selector)}).getBoundingClientRect()"
+        script = f"(r => [r.x, r.y, r.width, r.height])({found})"
         x, y, w, h = self.run(script)
         return x, y, w, h
 

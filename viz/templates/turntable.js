@@ -39,7 +39,7 @@ const controls = new THREE.OrbitControls(eye, canvas);
 controls.enableDamping = false;
 controls.enableZoom = false;  // until the picture is clicked, so that the page scrolls
 controls.minDistance = 0.25 * data.diagonal;
-controls.maxDistance = 14 * data.diagonal;
+controls.maxDistance = 30 * data.diagonal;
 controls.maxPolarAngle = 0.62 * Math.PI;
 canvas.style.touchAction = "pan-y";
 canvas.tabIndex = 0;
@@ -227,17 +227,17 @@ function makeSkeleton() {
 const turbo = (x) => new Color().setHSL(0.02 + 0.36 * x, 0.72, 0.34 + 0.16 * x);  // red: doubtful, green: sure
 function paintSurface() {
   const { main, painted, own, nodes } = subject, c = new Color();
-  const lit = state.hovered || state.chosen, node = lit ? (lit - 1) % nodes.length : -1;
+  const owner = (id) => (id ? (id - 1) % nodes.length : -1), hovered = owner(state.hovered), chosen = owner(state.chosen);
   const bodies = nodes.map((_, n) => {
     const sure = data.nodes[n].confidence;
     if (state.paint === "confidence") return sure === null ? new Color("#b0b2b6") : turbo(Math.min(1, Math.max(0, sure)));
     return state.paint === "plain" ? new Color("#b9c2ce") : bodyColor(n);
   });
-  const bright = new Color("#ffffff");
   for (let v = 0; v < main.length; v++) {
     if (state.paint === "own" && own) c.setRGB(own[3 * v] / 255, own[3 * v + 1] / 255, own[3 * v + 2] / 255, THREE.SRGBColorSpace);
     else c.copy(bodies[main[v]]);
-    if (main[v] === node) c.lerp(bright, 0.35);
+    if (main[v] === hovered) c.multiplyScalar(0.72);
+    else if (chosen >= 0 && main[v] !== chosen) c.lerp(paper, 0.6);
     c.toArray(painted.array, 3 * v);
   }
   painted.needsUpdate = true;
@@ -248,7 +248,7 @@ const rig = { group: new THREE.Group(), cameras: [] };
 function makeCameras() {
   scene.add(rig.group);
   data.cameras.forEach((camera, c) => {
-    const depth = 0.3 * data.diagonal, center = vector(camera.center);
+    const center = vector(camera.center), depth = 0.2 * center.distanceTo(vector(data.centers[0]).setY(data.middle));
     const corners = camera.corners.map((d) => vector(d));
     const quad = new THREE.BufferGeometry();
     quad.setAttribute("uv", new THREE.BufferAttribute(new Float32Array([0, 1, 1, 1, 1, 0, 0, 0]), 2));
@@ -335,7 +335,8 @@ function drawTrails() {
           if (!(a[0] === a[0] && b[0] === b[0])) continue;
           positions.push(...a, ...b);
           for (const g of [f, f + 1]) {
-            c.copy(paper).lerp(own, Math.max(0, 1 - (last - g) / TRAIL));
+            c.copy(own);
+            if (state.through < 0) c.lerp(paper, Math.min(1, (last - g) / TRAIL));
             colors.push(c.r, c.g, c.b);
           }
         }
@@ -555,6 +556,7 @@ function frameSubject() {
   const half = Math.tan((eye.fov * Math.PI) / 360), wide = half * eye.aspect;
   const tall = [Infinity, -Infinity], q = new Vector3();
   const shown = data.points.map((p) => vector(p).add(offset).sub(vector(data.centers[0])).add(vector(data.centers[frameNow() < data.centers.length ? frameNow() : 0])));
+  if (state.layers.cameras) rig.cameras.forEach((c) => { shown.push(c.center); c.corners.forEach((d) => shown.push(c.center.clone().addScaledVector(d, c.depth))); });
   const low = new Vector3(Infinity, Infinity, Infinity), high = low.clone().negate();
   shown.forEach((p) => { low.min(p); high.max(p); });
   const target = low.add(high).multiplyScalar(0.5);
@@ -664,7 +666,10 @@ function build() {
   if (data.tracks) tools.append(layer("points", "Points", "Points of the surface that were followed"));
   tools.append(layer("names", "Names", "Names of bodies and key-points"));
   if (data.cameras.length) {
-    tools.append(layer("cameras", "Cameras", "Cameras with their pictures"));
+    tools.append(chip("Cameras", "Cameras with their pictures", false, (on) => {
+      state.layers.cameras = on;
+      if (state.through < 0) frameSubject();
+    }));
     const views = [["-1", "Free view"], ...data.cameras.map((c, k) => [String(k), `Through ${c.name}`])];
     tools.append(choice("Look through a camera", views, "-1", (value) => look(Number(value))));
   }
