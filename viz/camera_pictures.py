@@ -87,7 +87,7 @@ def _pictures(capture: Capture, rig: Rig, camera: int, frames: list[int]) -> lis
         try:
             image = capture.frame(rig.names[camera], frame)
         except GeomocapError:
-            return []  # a capture of silhouettes alone has no pictures
+            return []  # the cameras are shown without
         small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
         if maps is not None:
             small = cv2.remap(small, *maps, interpolation=cv2.INTER_LINEAR, borderValue=(128, 128, 128))

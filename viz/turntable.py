@@ -99,16 +99,12 @@ def motion_of(results: Results, skeleton: Skeleton) -> MotionTree:
 
 
 def glb_of(results: Results, motion: MotionTree) -> bytes:
-    """Return `motion.glb`; made anew if it isn't there or is of another skeleton."""
+    """Return `motion.glb`; made anew if it isn't there, is of another skeleton, or shows no surface."""
     file = results.run.path / FILES["glb"]
+    if file.is_file() and (results.run.path / MODEL_FILE).is_file() and _is_of(data := file.read_bytes(), motion):
+        return data
     try:
-        data = file.read_bytes()
-        if _is_of(data, motion):
-            return data
-    except OSError:
-        pass
-    try:
-        mesh = surface_of_run(results.run, motion, ExportSettings())
+        mesh = surface_of_run(results.run, motion, ExportSettings(surface="skin"))
     except (MotionError, GeometryError, RunError):
         mesh = None  # bones show the motion, too
     return glb_bytes(motion, mesh or bone_mesh(motion))
