@@ -20,7 +20,7 @@ from geomocap.export.export_errors import MotionError
 from geomocap.export.export_settings import ExportSettings
 from geomocap.export.glb import glb_bytes
 from geomocap.export.motion_tree import MotionTree
-from geomocap.export.run_export import FILES, mean_radius, run_names, surface_of_run
+from geomocap.export.run_export import FILES, mean_radius, surface_of_run
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.skinned_mesh import bone_mesh
 from geomocap.model.skeleton import Skeleton
@@ -29,6 +29,7 @@ from viz.body_colors import body_color, hex_color
 from viz.camera_pictures import frusta
 from viz.floor import grid_spacing
 from viz.run_contents import Results
+from viz.shown_names import joint_names, names_of
 from viz.viewpoints import ViewStage
 
 SAMPLES = 40_000
@@ -95,7 +96,7 @@ def script_json(data: Any) -> str:
 def motion_of(results: Results, skeleton: Skeleton) -> MotionTree:
     """Return the motion as the run's files have it: a node for each body, in the order of the GLB file."""
     up: Axis = {"x": "x", "y": "y"}.get(results.up, "z")  # type: ignore[assignment]
-    return motion_from_skeleton(skeleton, up=up, names=run_names(results.run), radius=mean_radius(results.run))
+    return motion_from_skeleton(skeleton, up=up, names=names_of(results), radius=mean_radius(results.run))
 
 
 def glb_of(results: Results, motion: MotionTree) -> bytes:
@@ -157,11 +158,7 @@ def _nodes(results: Results, skeleton: Skeleton, motion: MotionTree) -> list[dic
     """Return what is told of each body and of the joint to its parent."""
     found = results.diagnostics
     sure, std, hinge = found.body_confidence, found.joint_std, found.joint_is_hinge
-    names = run_names(results.run)
-    joint_names = skeleton.joint_names
-    if names is not None:
-        bodies = names.body_names(skeleton.body_count, skeleton.body_names)
-        joint_names = np.array(names.joint_names(skeleton.joint_bodies, bodies, skeleton.joint_names))
+    called = joint_names(results, skeleton)
     tips = GLB.points(motion.tips, motion.up)
     nodes = []
     for n, name in enumerate(motion.names):
@@ -171,7 +168,7 @@ def _nodes(results: Results, skeleton: Skeleton, motion: MotionTree) -> list[dic
             precise = std is not None and len(std) == skeleton.joint_count and np.isfinite(std[j]).all()
             kind = "joint" if hinge is None or len(hinge) != skeleton.joint_count else ("hinge" if hinge[j] else "ball")
             joint = {
-                "name": str(joint_names[j]),
+                "name": called[j],
                 "kind": kind,
                 "std": 1000 * float(np.linalg.norm(std[j])) if std is not None and precise else None,
             }

@@ -103,7 +103,8 @@ def export_run(
     if unknown:
         raise MotionError(f"{unknown[0]}: no motion format; expected one of {', '.join(FILES)}")
     skeleton = read_skeleton(run)
-    names = names or run_names(run)
+    if names is None and (run.path / "names.toml").is_file():
+        names = Names.read(run.path / "names.toml")
     up = run_up(run)
     motion = motion_from_skeleton(skeleton, up=up, names=names, joints=settings.joints, radius=mean_radius(run))
     markers = run_markers(run, skeleton, names, up, ellipsoids=settings.ellipsoids)
@@ -130,12 +131,6 @@ def run_settings(run: Run) -> ExportSettings:
     file = run.path / "run.toml"
     recorded = run.read_record().get("config", {}).get("export", {}) if file.is_file() else {}
     return check_settings(ExportSettings, recorded, str(file))
-
-
-def run_names(run: Run) -> Names | None:
-    """Return the user's names, `RUN/names.toml`; None if there are none."""
-    file = run.path / "names.toml"
-    return Names.read(file) if file.is_file() else None
 
 
 def run_up(run: Run) -> Axis:
