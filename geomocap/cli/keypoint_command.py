@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Annotated
 
@@ -51,13 +50,13 @@ def keypoints(
     """
     file = points or run / "keypoints.toml"
     if edit:
-        _edit(Run(run), file, host, port)
+        edit_keypoints(Run(run), file, host, port)
     else:
         wanted = read_keypoints(file)
         _report(Run(run), wanted, follow_keypoints(Run(run), wanted))
 
 
-def _edit(run: Run, file: Path, host: str, port: int) -> None:
+def edit_keypoints(run: Run, file: Path, host: str, port: int) -> None:
     """Serve the editor until the user interrupts it; save when asked to."""
     from viz.keypoint_editor import KeyPointEditor
     from viz.keypoint_scene import Subject
@@ -81,8 +80,6 @@ def _edit(run: Run, file: Path, host: str, port: int) -> None:
         _report(run, wanted, found)
         return f"Saved {', '.join(p.name for p in (file, *found.files))}."
 
-    # browsers open connections ahead that they never use, which isn't worth a traceback
-    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     editor = KeyPointEditor(subject, Follower(Measured.of(tracks)), Session.open(begun), save, host, port)
     console.print(f"editor: {editor.url} (stop with Ctrl+C)", markup=False)
     try:
