@@ -214,10 +214,9 @@ class Viewer:
                 self.panel.say(str(error), wrong=True)
                 return
             self.panel.contents = self.contents
-            motion = self.contents[chosen.content].motion
-            assert motion is not None
+            renamed = self.contents[chosen.content].motion
             for node, label in self._shown[chosen.content]["names"]:
-                label.text = motion.names[node]
+                label.text = renamed.names[node] if renamed is not None else ""
             self.panel.tell(chosen)
             self.panel.say(f"Written to {file.name}. `geomocap export` gives the motion files these names.")
 
