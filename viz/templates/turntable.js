@@ -564,7 +564,7 @@ function frameSubject() {
   shown.forEach((p) => {
     q.copy(p).sub(target);
     const x = Math.abs(q.dot(right)), y = Math.abs(q.dot(head)), z = -q.dot(forward);
-    distance = Math.max(distance, x / (0.92 * wide) + z, y / (0.84 * half) + z);
+    distance = Math.max(distance, x / (0.87 * wide) + z, y / (0.82 * half) + z);
   });
   controls.target.copy(target);
   eye.position.copy(target).addScaledVector(forward, -distance);
