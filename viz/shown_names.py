@@ -15,7 +15,18 @@ from viz.run_contents import Results
 
 
 def names_of(results: Results) -> Names:
-    """Return the names of a run's bodies and joints, `RUN/names.toml`; none if there is no such file."""
+    """Return the names of a run's bodies and joints: the user's, and for what these leave unnamed those found."""
+    own, found = users_names(results), Names()
+    file = results.run.path / "names_found.toml"
+    if file.is_file():
+        found = Names.read(file)
+    bodies = {b: name for b, name in found.bodies.items() if name not in own.bodies.values()}
+    joints = {j: name for j, name in found.joints.items() if name not in own.joints.values()}
+    return Names({**bodies, **own.bodies}, {**joints, **own.joints}, own.source)
+
+
+def users_names(results: Results) -> Names:
+    """Return the names that the user gave, `RUN/names.toml`; none if there is no such file."""
     file = results.run.path / "names.toml"
     return Names.read(file) if file.is_file() else Names()
 
@@ -57,7 +68,7 @@ def rename(results: Results, kind: str, number: int, name: str) -> Path:
     file, skeleton = results.run.path / "names.toml", results.skeleton
     if skeleton is None:
         raise RunError(f"{results.run.path}: has no bodies that could be named")
-    before = names_of(results)
+    before = users_names(results)
     bodies, joints = dict(before.bodies), dict(before.joints)
     (bodies if kind == "body" else joints).pop(number, None)
     if name:
