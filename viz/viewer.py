@@ -110,7 +110,7 @@ class Viewer:
         view = stage.view(30.0, 12.0, (800, 800), _FIELD_DEG)
         R, t = view.cam_from_world[:, :3], view.cam_from_world[:, 3]
         middle = R.T @ (np.array([0, 0, t[2]]) - t) + sum(self._offsets) / len(self._offsets)
-        away = R.T @ np.array([0, 0, t[2]]) * (1.0 if len(self.contents) == 1 else wide / stage.diagonal)
+        away = R.T @ np.array([0, 0, t[2]]) * (1.0 if len(self.contents) == 1 else 0.75 * wide / stage.diagonal)
         first = self.server.initial_camera
         first.look_at, first.position = middle, middle - away
         first.up, first.fov = stage.up, np.radians(1.15 * _FIELD_DEG)

@@ -221,19 +221,24 @@ def test_the_server_answers_its_own_page_only(made):
 def test_two_runs_play_side_by_side_and_bodies_are_renamed_by_a_click(made, run):
     contents = of_run(Results(run, made.capture)), of_run(Results(made.run))
     with served(*contents) as viewer, chromium() as page:
-        page.show(900, 500)
+        page.show(1300, 650)
         page.open(viewer.url + "/")
         _until(lambda: viewer.server.get_clients())
         client = next(iter(viewer.server.get_clients().values()))
         _until(lambda: client.camera.update_timestamp > 0)
-        picture = client.get_render(400, 600, timeout=60).astype(int)
-        strong = np.ptp(picture[..., :3], axis=2) > 50
-        assert strong[:, :300].sum() > 500 and strong[:, 300:].sum() > 500  # one at the left, one at the right
+        box, middle = page.box("canvas"), contents[0].posture[1][0][1:].mean(axis=0)
 
-        at = contents[0].posture[1][0][1:].mean(axis=0)
-        box = page.box("canvas")
+        def places() -> list[tuple[float, float]]:
+            return [_pixel(client, middle + offset, box) for offset in viewer._offsets]
+
+        def drawn() -> bool:
+            picture = page.pixels().astype(int)
+            around = [picture[int(y) - 8 : int(y) + 8, int(x) - 8 : int(x) + 8] for x, y in places()]
+            return all(part.size > 0 and np.ptp(part, axis=2).max() > 50 for part in around)
+
+        _until(drawn)  # both of them
         for _ in range(6):  # drawing in software takes its time: a click may come before there is something to hit
-            page.click(*_pixel(client, at, box))
+            page.click(*places()[0])
             if _soon(lambda: viewer.chosen is not None, 10):
                 break
         assert viewer.chosen is not None and viewer.chosen.content == 0
