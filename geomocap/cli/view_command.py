@@ -31,6 +31,10 @@ def view(
     port: Annotated[
         int, typer.Option("--port", min=1, max=65535, help="Port of the page; the next free one if it is taken.")
     ] = 8080,
+    rerun: Annotated[
+        Path | None,
+        typer.Option("--rerun", metavar="FILE.rrd", help="Write a Rerun recording instead; needs the extra rerun."),
+    ] = None,
     workers: Workers = None,
 ) -> None:
     """Look at a run, capture, scans, calibration or motion file in the browser; needs the extra view.
@@ -51,6 +55,12 @@ def view(
         for p in (path, other)
         if p is not None
     ]
+    if rerun is not None:
+        from viz.rerun_recording import write_recording
+
+        write_recording(rerun, contents)
+        console.print(f"recording: {rerun}", markup=False)
+        return
     viewer = Viewer(contents, host, port)
     console.print(f"viewer: {viewer.url} (stop with Ctrl+C)", markup=False)
     try:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import http.client
 import shutil
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ import open3d as o3d
 import pytest
 
 from geomocap.errors import GeomocapError
-from geomocap.export.export_errors import MotionError
+from geomocap.export.export_errors import MissingPackageError, MotionError
 from geomocap.export.names import Names
 from geomocap.export.run_export import export_run
 from geomocap.export.skinned_mesh import SkinnedMesh, bone_mesh
@@ -212,6 +214,30 @@ def test_the_server_answers_its_own_page_only(made):
         assert status(Origin="http://evil.example", **socket) == 403
         assert status(Origin="http://evil.example") == 403
         assert status(Host="evil.example") == 403
+
+
+# --- a recording for Rerun ---
+
+
+def test_recordings_for_rerun_hold_every_frame(made, tmp_path):
+    pytest.importorskip("rerun", reason="Rerun recordings need the package rerun-sdk")
+    from viz.rerun_recording import write_recording
+
+    one, six = tmp_path / "one.rrd", tmp_path / "six.rrd"
+    content = of_run(Results(made.run, made.capture))
+    write_recording(six, [content])
+    write_recording(one, [replace(content, n_frames=1)])
+    assert one.read_bytes()[:3] == six.read_bytes()[:3] == b"RRF"
+    assert six.stat().st_size > 3 * one.stat().st_size
+    assert sorted(f.name for f in tmp_path.glob("*.rrd")) == ["one.rrd", "six.rrd"]
+
+
+def test_without_rerun_the_line_says_what_to_install(made, tmp_path, monkeypatch):
+    from viz.rerun_recording import write_recording
+
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(MissingPackageError, match=r"geomocap\[rerun\]"):
+        write_recording(tmp_path / "x.rrd", [])
 
 
 # --- the page in a browser ---
