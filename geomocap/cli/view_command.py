@@ -9,7 +9,7 @@ import typer
 
 from geomocap.cli.arguments import Workers
 from geomocap.cli.console import console
-from geomocap.cli.reports import capture_of
+from geomocap.cli.reports import capture_of, existing_run
 from geomocap.cli.settings_options import with_file_of_options
 from geomocap.files.run import Run
 
@@ -45,7 +45,7 @@ def view(
     if keypoints:
         from geomocap.cli.keypoint_command import edit_keypoints
 
-        edit_keypoints(Run(path), path / "keypoints.toml", host, port)
+        edit_keypoints(existing_run(path), path / "keypoints.toml", host, port, wait=False)
         return
     from viz.view_content import open_content
     from viz.viewer import Viewer

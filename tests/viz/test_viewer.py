@@ -24,7 +24,6 @@ from geomocap.export.skinned_mesh import SkinnedMesh, bone_mesh
 from geomocap.files.run import Run
 from tests.viz.chromium import chromium
 from tests.viz.conftest import LIMBS, Made
-from viz.local_page import is_own
 from viz.run_contents import Results
 from viz.shown_names import names_of, rename
 from viz.view_content import Content, of_run, open_content
@@ -152,26 +151,6 @@ def test_found_names_stand_where_the_user_gave_none(run):
 
 
 # --- who may talk to it ---
-
-
-@pytest.mark.parametrize(
-    ("origin", "host", "address", "answer"),
-    [
-        ("http://127.0.0.1:8080", "127.0.0.1:8080", "127.0.0.1", True),
-        ("http://localhost:8080", "localhost:8080", "127.0.0.1", True),
-        ("http://[::1]:8080", "[::1]:8080", "::1", True),
-        (None, "127.0.0.1:8080", "127.0.0.1", True),  # a program, no browser
-        ("http://evil.example", "127.0.0.1:8080", "127.0.0.1", False),
-        ("http://127.0.0.1:9090", "127.0.0.1:8080", "127.0.0.1", False),
-        ("http://evil.example:8080", "evil.example:8080", "127.0.0.1", False),  # a name that was made to lead here
-        ("null", "127.0.0.1:8080", "127.0.0.1", False),
-        (None, None, "127.0.0.1", False),
-        ("http://lab-pc:8080", "lab-pc:8080", "0.0.0.0", True),
-        ("http://evil.example", "lab-pc:8080", "0.0.0.0", False),
-    ],
-)
-def test_foreign_pages_are_refused(origin, host, address, answer):
-    assert is_own(origin, host, address) is answer
 
 
 @contextmanager
