@@ -53,7 +53,7 @@ ROOMS["pipeline"] = set(ROOMS)
 ROOMS["geomocap"] = set(ROOMS)
 ROOMS["data_tools"] = VALUES | {"files", "silhouettes"}
 ROOMS["viz"] = VALUES | {"files", "calibration", "keypoints", "trajectories", "dense", "matching"}
-ROOMS["viz"] |= {"angles", "export", "evaluation", "inspection"}
+ROOMS["viz"] |= {"angles", "export", "evaluation", "inspection", "subject"}
 ROOMS["cli"] = set(ROOMS)
 ROOMS["__main__"] = {"cli"}
 

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from geomocap.calibration.bar_calibration import Calibration
 from geomocap.files.atomic import write_bytes
 from viz.body_colors import ACCENT, INK, body_color, hex_color
+from viz.drawing import DENSITY
 from viz.figures import plot
 from viz.report import Block, Report, Section, table, text, write_report
 from viz.report import plot as plot_block
@@ -202,7 +203,7 @@ def _colors(count: int) -> tuple[str, ...]:
 def _grid(count: int, width: float, ratio: float) -> tuple[Figure, list[Axes]]:
     columns = {1: 1, 2: 2, 4: 2}.get(count, 4 if count > 6 else 3)
     rows = -(-count // columns)
-    figure = Figure(figsize=(width, rows * (width / columns * ratio + 0.35)), dpi=150, layout="constrained")
+    figure = Figure(figsize=(width, rows * (width / columns * ratio + 0.35)), dpi=100 * DENSITY, layout="constrained")
     axes = [figure.add_subplot(rows, columns, k + 1) for k in range(count)]
     return figure, axes
 
@@ -228,7 +229,7 @@ def layout(calibration: Calibration) -> Figure:
     n = c.adjusted.network
     up = c.up
     order = UP_COLUMNS[up]
-    figure = Figure(figsize=(9.2, 4.9), dpi=150, layout="constrained")
+    figure = Figure(figsize=(9.2, 4.9), dpi=100 * DENSITY, layout="constrained")
     ax = figure.add_subplot(1, 2, 1, projection="3d")
     plan = figure.add_subplot(1, 2, 2)
     bars = n.bars[..., order]
@@ -343,7 +344,7 @@ def coverage_maps(calibration: Calibration) -> Figure:
 def held_out_lengths(calibration: Calibration) -> Figure:
     """Draw the length errors of the held-out bars over frames and as a histogram."""
     h = calibration.held_out
-    figure = Figure(figsize=(9.2, 2.8), dpi=150, layout="constrained")
+    figure = Figure(figsize=(9.2, 2.8), dpi=100 * DENSITY, layout="constrained")
     grid = figure.add_gridspec(1, 2, width_ratios=[3, 1])
     ax = figure.add_subplot(grid[0])
     errors = 1000 * h.errors

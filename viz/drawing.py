@@ -18,8 +18,14 @@ from viz.body_colors import INK
 FAINT = (118, 124, 133)
 """Secondary text, RGB 0–255."""
 
+DENSITY = 2
+"""Pixels of a picture along a pixel of the page that shows it."""
+
+FRAME = (168, 174, 182)
+"""Fine line around pictures, RGB 0–255."""
+
 GAP = 8
-"""Pixels between the pictures of a sheet."""
+"""Pixels of the page between the pictures of a sheet."""
 
 
 @cache
@@ -43,7 +49,7 @@ def write_on(
 
     Parameters
     ----------
-    image : (H, W, 3) uint8
+    image : (H, W, 3) or (H, W, 4) uint8
     text : str
     position : (float, float)
         Where the anchor stands: x, y in pixels.
@@ -133,55 +139,71 @@ def sheet(
 
     Parameters
     ----------
-    rows : sequence of sequences of (H, W, 3) uint8 or None
+    rows : sequence of sequences of (H, W, 3) or (H, W, 4) uint8 or None
         Pictures may differ in size; each is centred in its cell.
     row_labels, column_labels : sequence of str
     framed : bool
         Draw a fine line around each picture.
+
+    Returns
+    -------
+    (H, W, 4) uint8
+        RGB and opacity: what is around the pictures is clear, so that the sheet suits any page.
     """
+    gap, letters = GAP * DENSITY, 13 * DENSITY
     n_columns = max(len(r) for r in rows)
     columns = [[r[c] for r in rows if c < len(r)] for c in range(n_columns)]
     widths = [max((p.shape[1] for p in column if p is not None), default=0) for column in columns]
     heights = [max((p.shape[0] for p in r if p is not None), default=0) for r in rows]
-    label_width = max((text_width(t, 13) for t in row_labels), default=0) + (14 if row_labels else 0)
-    label_height = 26 if column_labels else GAP
-    canvas = np.full(
-        (label_height + sum(heights) + GAP * len(rows), label_width + sum(widths) + GAP * (n_columns + 1), 3),
-        255,
-        np.uint8,
+    label_width = max((text_width(t, letters) for t in row_labels), default=0) + (14 * DENSITY if row_labels else 0)
+    label_height = 26 * DENSITY if column_labels else gap
+    canvas = np.empty(
+        (label_height + sum(heights) + gap * len(rows), label_width + sum(widths) + gap * (n_columns + 1), 4), np.uint8
     )
+    canvas[:] = (*FAINT, 0)  # words mix with the colour of what is clear, too
     y = label_height
     for r, row in enumerate(rows):
-        x = label_width + GAP
+        x = label_width + gap
         for c, picture in enumerate(row):
             if picture is not None:
                 h, w = picture.shape[:2]
                 left, top = x + (widths[c] - w) // 2, y + (heights[r] - h) // 2
-                canvas[top : top + h, left : left + w] = picture
+                place = canvas[top : top + h, left : left + w]
+                place[..., : picture.shape[2]] = picture
+                if picture.shape[2] == 3:
+                    place[..., 3] = 255
                 if framed:
-                    cv2.rectangle(canvas, (left, top), (left + w - 1, top + h - 1), (205, 209, 214), 1)
-            x += widths[c] + GAP
-        y += heights[r] + GAP
-    x = label_width + GAP
+                    cv2.rectangle(canvas, (left, top), (left + w - 1, top + h - 1), (*FRAME, 255), DENSITY)
+            x += widths[c] + gap
+        y += heights[r] + gap
+    x = label_width + gap
     for c, label in enumerate(column_labels):
-        canvas = write_on(canvas, label, (x + widths[c] / 2, label_height / 2), 13, FAINT, anchor="mm")
-        x += widths[c] + GAP
+        canvas = write_on(canvas, label, (x + widths[c] / 2, label_height / 2), letters, FAINT, anchor="mm")
+        x += widths[c] + gap
     y = label_height
     for r, label in enumerate(row_labels):
-        canvas = write_on(canvas, label, (label_width - 6, y + heights[r] / 2), 13, FAINT, anchor="rm")
-        y += heights[r] + GAP
+        canvas = write_on(canvas, label, (label_width - 6 * DENSITY, y + heights[r] / 2), letters, FAINT, anchor="rm")
+        y += heights[r] + gap
     return canvas
 
 
+def on_paper(image: np.ndarray) -> np.ndarray:
+    """Return an image, (H, W, 3) or with opacity (H, W, 4) uint8, on white: (H, W, 3) uint8."""
+    if image.shape[2] == 3:
+        return image
+    opacity = image[..., 3:].astype(np.uint16)
+    return ((image[..., :3] * opacity + 255 * (255 - opacity) + 127) // 255).astype(np.uint8)
+
+
 def write_png(path: Path, image: np.ndarray) -> None:
-    """Write an image (H, W, 3) uint8 RGB as PNG, whole or not at all."""
+    """Write an image (H, W, 3) uint8 RGB as PNG, whole or not at all; one with opacity on white."""
     buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG", optimize=False, compress_level=4)
+    Image.fromarray(on_paper(image)).save(buffer, "PNG", optimize=False, compress_level=4)
     write_bytes(path, buffer.getbuffer())
 
 
-def jpeg(image: np.ndarray, quality: int = 88) -> bytes:
-    """Return an image (H, W, 3) uint8 RGB as the bytes of a JPEG without colour subsampling."""
+def webp(image: np.ndarray, quality: int = 76) -> bytes:
+    """Return an image (H, W, 3) uint8 RGB, or (H, W, 4) with opacity, as the bytes of a WebP picture."""
     buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "JPEG", quality=quality, subsampling=0, optimize=True)
+    Image.fromarray(image).save(buffer, "WEBP", quality=quality, alpha_quality=60, method=4)
     return buffer.getvalue()

@@ -17,6 +17,7 @@ from geomocap.files.run import Run
 from geomocap.model.skeleton import Skeleton
 from geomocap.progress import Progress, silent
 from viz.body_colors import ACCENT, body_color, hex_color
+from viz.drawing import DENSITY
 from viz.figures import MUTED, plot
 from viz.matching_review import error_sheet, surface_errors
 from viz.report import Block, Report, Section, missing, picture, table, text, write_report
@@ -111,7 +112,7 @@ def _over_time(curves: Sequence[Curve]) -> list[Block]:
 def curve_plots(curves: Sequence[Curve]) -> Figure:
     """Plot each curve in its own axes."""
     rows = (len(curves) + 1) // 2
-    figure = Figure(figsize=(9.6, 1.9 * rows), dpi=140, layout="constrained")
+    figure = Figure(figsize=(9.6, 1.9 * rows), dpi=100 * DENSITY, layout="constrained")
     axes = figure.subplots(rows, 2, squeeze=False).ravel()
     for ax, curve in zip(axes, curves, strict=False):
         marker = "." if len(curve.frames) < 40 else None
@@ -128,7 +129,7 @@ def curve_plots(curves: Sequence[Curve]) -> Figure:
 @plot
 def together(curves: Sequence[Curve]) -> Figure:
     """Plot several curves of one unit in the same axes."""
-    figure = Figure(figsize=(9.6, 2.9), dpi=140, layout="constrained")
+    figure = Figure(figsize=(9.6, 2.9), dpi=100 * DENSITY, layout="constrained")
     ax = figure.subplots()
     for k, curve in enumerate(curves):
         ax.plot(curve.frames, curve.values, color=hex_color(body_color(k)), label=curve.name, lw=1.0)
@@ -191,7 +192,7 @@ def _side_axes(vertices: np.ndarray) -> tuple[int, int]:
 @plot
 def body_errors(frame: LabelledFrame, truth: Truth, number: int) -> Figure:
     """Draw found and true bodies and the distances from the true surface, seen from the side."""
-    figure = Figure(figsize=(9.6, 5.6), dpi=140, layout="constrained")
+    figure = Figure(figsize=(9.6, 5.6), dpi=100 * DENSITY, layout="constrained")
     axes = figure.subplots(1, 3, sharex=True, sharey=True)
     across, up = _side_axes(truth.vertices[number])
     order = np.argsort(frame.points[:, 1 - across] * (1 if across == 1 else -1))
@@ -213,7 +214,7 @@ def body_errors(frame: LabelledFrame, truth: Truth, number: int) -> Figure:
 @plot
 def joint_errors(result: Evaluation, skeleton: Skeleton, truth: Truth, frame: int) -> Figure:
     """Draw matched joints, found and true, over the true surface of a frame, from two sides."""
-    figure = Figure(figsize=(9.6, 5.6), dpi=140, layout="constrained")
+    figure = Figure(figsize=(9.6, 5.6), dpi=100 * DENSITY, layout="constrained")
     found = {str(n): p for n, p in zip(skeleton.joint_names, skeleton.joint_positions[frame], strict=True)}
     true = {str(n): p for n, p in zip(truth.joint_names, truth.joint_positions[frame], strict=True)}
     pairs = [(found[m.found], true[m.true]) for m in result.matches if m.found in found and m.true in true]

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from geomocap.model.ellipsoids import Ellipsoids
 from geomocap.model.skeleton import Skeleton
 from viz.body_colors import ACCENT, INK, body_color, hex_color
+from viz.drawing import DENSITY
 from viz.quality_figures import Bone, Coverage, PathFigures
 
 P = ParamSpec("P")
@@ -60,7 +61,7 @@ def plot(draw: Callable[P, Figure]) -> Callable[P, bytes]:
 
 def figure_of(width: float, height: float) -> Figure:
     """Return an empty figure, sizes in inches."""
-    return Figure(figsize=(width, height), dpi=140, layout="constrained")
+    return Figure(figsize=(width, height), dpi=100 * DENSITY, layout="constrained")
 
 
 def times_axis(count: int, fps: float | None) -> tuple[np.ndarray, str]:

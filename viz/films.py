@@ -16,8 +16,8 @@ from geomocap.files.whole_files import is_whole_mp4
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads
 from viz import scene
-from viz.drawing import GAP, fit, write_on
-from viz.rendering import Model
+from viz.drawing import GAP, fit, on_paper, write_on
+from viz.rendering import Look, Model
 from viz.run_contents import Results
 from viz.sheets import overlay, picture, tile_size
 from viz.viewpoints import ViewStage
@@ -118,10 +118,10 @@ def motion_video(
         bones = scene.skeleton(results, frame, stage.diagonal)
         panels = []
         if show_bodies:
-            panels.append(picture(results, stage, Model([skin]), view, frame))
+            panels.append(on_paper(picture(results, stage, Model([skin]), view, frame, Look())))
         model = Model([scene.glass(skin), *bones] if bones else [skin])
         if bones:
-            panels.append(picture(results, stage, model, view, frame))
+            panels.append(on_paper(picture(results, stage, model, view, frame, Look())))
         if camera is not None:
             drawn = overlay(results, camera, frame, model, 520, 1.0 if bones else 0.7)
             panels.append(fit(drawn, (round(size[1] * drawn.shape[1] / drawn.shape[0]), size[1])))

@@ -7,12 +7,14 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from viz.rendering import PAPER
+from viz.rendering import Layer
 from viz.shapes import Mesh
 from viz.viewpoints import PinholeView, ViewStage
 
-LINE = (222, 225, 229)
-SHADE = (120, 126, 135)
+LINE = (135, 143, 153, 0.27)
+"""Colour and opacity of the grid's lines; they show on light and dark pages."""
+SHADE = 0.3
+"""Opacity of the shadow where it is darkest."""
 _VERTICES = 40_000  # about as many throw the shadow
 
 
@@ -22,10 +24,8 @@ def grid_spacing(diagonal: float) -> float:
     return float(max(m for m in (1, 2, 5) if m * power <= diagonal / 6 + 1e-12) * power)
 
 
-def floor(
-    stage: ViewStage, view: PinholeView, meshes: Sequence[Mesh] = (), center: np.ndarray | None = None
-) -> np.ndarray:
-    """Draw the floor as a view sees it: (H, W, 3) uint8, RGB.
+def floor(stage: ViewStage, view: PinholeView, meshes: Sequence[Mesh] = (), center: np.ndarray | None = None) -> Layer:
+    """Draw the floor as a view sees it, clear but for its lines and the shadow.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def floor(
     """
     width, height = view.size
     scale = 2
-    image = np.full((height * scale, width * scale, 3), PAPER, np.float32)
+    dark = np.zeros((height * scale, width * scale), np.float32)
     right = stage.broad
     ahead = np.cross(stage.up, right)
     middle = stage.centers[0] if center is None else np.asarray(center, float)
@@ -46,10 +46,10 @@ def floor(
     basis = np.array([right, ahead])
     seen_from_below = view.cam_from_world[:, :3].T @ view.cam_from_world[:, 3] @ stage.up > -stage.floor
     if seen_from_below:
-        return image[::scale, ::scale].astype(np.uint8)
+        return Layer(np.zeros((height, width, 4), np.float32))
 
     if meshes:
-        _shadow(image, stage, view, meshes, base, basis, scale)
+        dark = _shadow(dark.shape, stage, view, meshes, base, basis, scale)
     step = grid_spacing(stage.diagonal)
     # The grid is fixed to the world: lines are at multiples of the step.
     origin = basis @ base
@@ -62,29 +62,34 @@ def floor(
             flat = np.column_stack([np.full(33, i), along])[:, [0, 1] if k == 0 else [1, 0]]
             segments.append(np.stack([flat[:-1], flat[1:]], axis=1))
     flat = np.concatenate(segments).reshape(-1, 2)
-    _lines(image, view, base + (flat - origin) @ basis, scale)
-    return cv2.resize(np.clip(image, 0, 255).astype(np.uint8), (width, height), interpolation=cv2.INTER_AREA)
+    line = LINE[3] * _lines(dark.shape, view, base + (flat - origin) @ basis, scale)
+    rgba = np.empty((*dark.shape, 4), np.float32)
+    rgba[..., :3] = line[..., None] * np.array(LINE[:3], np.float32) / 255  # the shadow is black
+    rgba[..., 3] = line + (1 - line) * dark
+    return Layer(cv2.resize(rgba, (width, height), interpolation=cv2.INTER_AREA))
 
 
-def _lines(image: np.ndarray, view: PinholeView, points: np.ndarray, scale: int) -> None:
-    """Draw segments between each two of the points (2 N, 3) that lie in front of the view."""
+def _lines(shape: tuple[int, int], view: PinholeView, points: np.ndarray, scale: int) -> np.ndarray:
+    """Draw segments between each two of the points (2 N, 3) that lie in front of the view: (H, W) float, 0 to 1."""
     pixels = view.project(points)[0].reshape(-1, 2, 2)
     near = np.isfinite(pixels).all(axis=(1, 2))
     near[near] = (np.abs(pixels[near]) < 1e4).all(axis=(1, 2))
     ends = np.rint((pixels[near] * scale - 0.5) * 16).astype(np.int32)
-    cv2.polylines(image, list(ends), False, LINE, 1, cv2.LINE_AA, 4)
+    drawn = np.zeros(shape, np.uint8)
+    cv2.polylines(drawn, list(ends), False, 255, 1, cv2.LINE_8, 4)
+    return drawn.astype(np.float32) / 255
 
 
 def _shadow(
-    image: np.ndarray,
+    shape: tuple[int, int],
     stage: ViewStage,
     view: PinholeView,
     meshes: Sequence[Mesh],
     base: np.ndarray,
     basis: np.ndarray,
     scale: int,
-) -> None:
-    """Darken the floor below the meshes, the more the nearer they are to it."""
+) -> np.ndarray:
+    """Darkness (H, W) of the floor below the meshes, 0 to 1, the more the nearer they are to it."""
     cells = 160
     reach = 0.75 * stage.diagonal
     vertices = np.concatenate([m.vertices for m in meshes])
@@ -100,8 +105,8 @@ def _shadow(
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float) * reach
     pixels, depth = view.project(base + corners @ basis)
     if (depth <= 0).any():
-        return
+        return np.zeros(shape, np.float32)
     source = np.array([[0, 0], [cells, 0], [cells, cells], [0, cells]], np.float32) - 0.5
     H = cv2.getPerspectiveTransform(source, (pixels * scale - 0.5).astype(np.float32))
-    dark = cv2.warpPerspective(table, H, (image.shape[1], image.shape[0]))[..., None]
-    image[:] = image + np.clip(0.55 * dark, 0, 1) * (np.array(SHADE, np.float32) - image)
+    dark = cv2.warpPerspective(table, H, (shape[1], shape[0]))
+    return SHADE * np.clip(dark, 0, 1)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from geomocap.scheduling import map_items, threads
 from viz.body_colors import INK, body_color, hex_color
-from viz.drawing import resize, sheet
+from viz.drawing import DENSITY, resize, sheet
 from viz.figures import WIDTH, figure_of, plot, times_axis
 from viz.keypoint_marks import Marks, marked
 from viz.run_contents import Results
@@ -98,7 +98,7 @@ def overlay_sheet(results: Results, marks: Marks, frames: Sequence[int], most: i
         tiles: list[np.ndarray | None] = []
         for frame in frames:
             image = capture.frame(camera, frame)
-            scale = min(1.0, 420 / max(image.shape[:2]))
+            scale = min(1.0, 420 * DENSITY / max(image.shape[:2]))
             small = resize(image, (round(image.shape[1] * scale), round(image.shape[0] * scale)))
             tiles.append(marked(small, capture.rig.select([camera]), marks, frame))
         return tiles

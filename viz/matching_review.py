@@ -11,7 +11,7 @@ from geomocap.dense.dense_frame import CloudFrame, TemplateCloud
 from geomocap.matching.growing import SurfaceMatches
 from geomocap.model.ray_casting import TriangleScene
 from viz.body_colors import ACCENT, INK, body_color
-from viz.drawing import faded, sheet, text_width, write_on
+from viz.drawing import DENSITY, faded, on_paper, sheet, text_width, write_on
 from viz.viewpoints import look
 
 PARTLY = (230, 130, 20)
@@ -48,7 +48,7 @@ def matched_picture(image: np.ndarray, surface: SurfaceMatches, width: int = 900
     ):
         _dots(canvas, place(surface.grid.pixels[which]), size, color)
     for x, y in place(surface.seeds.pixels):
-        cv2.circle(canvas, (x, y), size + 3, INK, 1, cv2.LINE_AA)
+        cv2.circle(canvas, (x, y), size + 3, INK, DENSITY, cv2.LINE_AA)
     words = (
         (f"{int(everywhere.sum())} in all images", ACCENT),
         (f"{int((surface.matched & ~everywhere).sum())} in some", PARTLY),
@@ -108,7 +108,7 @@ def cloud_picture(
     azimuth_deg: float,
     elevation_deg: float = 10.0,
     up: Sequence[float] = (0.0, 0.0, 1.0),
-    size: tuple[int, int] = (300, 420),
+    size: tuple[int, int] = (300 * DENSITY, 420 * DENSITY),
 ) -> np.ndarray:
     """Draw a cloud from one side, the nearer points before the farther ones.
 
@@ -146,7 +146,7 @@ def cloud_picture(
     x = np.rint(seen[:, 0] * scale * 2 + width / 2).astype(int)
     y = np.rint(seen[:, 1] * scale * 2 + height / 2).astype(int)
     spacing = np.sqrt((high - low).max() * np.median(high - low) / max(len(points), 1)) * scale * 2
-    reach = int(np.clip(np.ceil(spacing), 1, 4))
+    reach = int(np.clip(np.ceil(spacing), 1, 4 * DENSITY))
     order = np.argsort(-seen[:, 2], kind="stable")
     for dy in range(reach):
         for dx in range(reach):
@@ -161,7 +161,7 @@ def cloud_sheet(
     colors: np.ndarray,
     azimuths_deg: Sequence[float] = (-60, -20, 20, 60),
     up: Sequence[float] = (0.0, 0.0, 1.0),
-    size: tuple[int, int] = (300, 420),
+    size: tuple[int, int] = (300 * DENSITY, 420 * DENSITY),
 ) -> np.ndarray:
     """Return a cloud from several sides, in a row: (H, W, 3) uint8. Parameters as in `cloud_picture`."""
     pictures = [cloud_picture(points, colors, a, up=up, size=size) for a in azimuths_deg]
@@ -203,7 +203,7 @@ def error_sheet(
     return _captioned(picture, ((f"−{limit * 1e3:.1f} mm", _LOW), (f"+{limit * 1e3:.1f} mm", _HIGH), (words, INK)))
 
 
-def template_sheet(image: np.ndarray, cloud: TemplateCloud, width: int = 460) -> np.ndarray:
+def template_sheet(image: np.ndarray, cloud: TemplateCloud, width: int = 460 * DENSITY) -> np.ndarray:
     """Return matched points, regions and shifts of one template, side by side: (H, W, 3) uint8."""
     surface = cloud.surface
     pictures = [
@@ -259,11 +259,12 @@ def _seed_row(surface: SurfaceMatches, seed: int) -> int:
 
 def _captioned(picture: np.ndarray, words: Sequence[tuple[str, Sequence[int]]]) -> np.ndarray:
     """Put a line of coloured words below a picture."""
-    canvas = np.full((picture.shape[0] + 24, picture.shape[1], 3), 255, np.uint8)
-    canvas[: picture.shape[0]] = picture
-    x = 6.0
+    d = DENSITY
+    canvas = np.full((picture.shape[0] + 24 * d, picture.shape[1], 3), 255, np.uint8)
+    canvas[: picture.shape[0]] = on_paper(picture)
+    x = 6.0 * d
     for text, color in words:
         if text:
-            canvas = write_on(canvas, text, (x, picture.shape[0] + 5), 12, color, bold=True)
-            x += text_width(text, 12, bold=True) + 12
+            canvas = write_on(canvas, text, (x, picture.shape[0] + 5 * d), 12 * d, color, bold=True)
+            x += text_width(text, 12 * d, bold=True) + 12 * d
     return canvas

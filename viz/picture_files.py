@@ -18,11 +18,11 @@ from geomocap.files.scan_geometry import read_mesh
 from geomocap.model.surface import vertex_normals
 from geomocap.reading import open_plain
 from viz.body_colors import body_colors
-from viz.drawing import sheet, write_png
+from viz.drawing import DENSITY, sheet, write_png
 from viz.floor import floor
 from viz.rendering import Model
 from viz.shapes import Mesh
-from viz.sheets import VIEWS, tile_size
+from viz.sheets import FINE, VIEWS, tile_size
 from viz.viewpoints import stage_of, up_vector
 from viz.volumes import cubes, gems, spacing
 
@@ -125,7 +125,7 @@ def render_file(path: Path, picture: Path | None = None, up: str = "z") -> Path:
     model = Model([mesh])
     tiles: list[np.ndarray | None] = []
     for angles in VIEWS.values():
-        view = stage.view(*angles, tile_size(stage, *angles, 160_000))
-        tiles.append(model.render(view, None, stage.up).over(floor(stage, view, model.meshes)))
+        view = stage.view(*angles, tile_size(stage, *angles, 160_000 * DENSITY**2))
+        tiles.append(model.render(view, FINE, stage.up).above(floor(stage, view, model.meshes)).clear())
     write_png(target, sheet([tiles], (), tuple(VIEWS)))
     return target

@@ -35,12 +35,15 @@ class Look:
         Darkness of the outlines of opaque surfaces, 0 to 1.
     hollows : float
         Darkening where one surface lies just behind another, 0 to 1.
+    reach : float
+        How far around a surface that darkening is seen, pixels.
     """
 
     samples: int = 2
     layers: int = 2
     outline: float = 0.55
     hollows: float = 0.45
+    reach: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,16 @@ class Layer:
     """
 
     rgba: np.ndarray
+
+    def above(self, below: Layer) -> Layer:
+        """Return this picture and, where it is clear, another one behind it."""
+        return Layer(self.rgba + (1 - self.rgba[..., 3:]) * below.rgba)
+
+    def clear(self) -> np.ndarray:
+        """Return the picture without a background: (H, W, 4) uint8, RGB and opacity."""
+        opacity = np.clip(self.rgba[..., 3:], 0, 1)
+        color = np.clip(self.rgba[..., :3] / np.maximum(opacity, 1e-6), 0, 1)
+        return np.rint(255 * np.concatenate([color, opacity], axis=2)).astype(np.uint8)
 
     def over(self, background: np.ndarray | tuple[int, int, int] = PAPER, opacity: float = 1.0) -> np.ndarray:
         """Return the picture on a background: an image (H, W, 3) uint8 or one colour, RGB; (H, W, 3) uint8."""
@@ -232,20 +245,19 @@ def _opaque(surfaces: _Surfaces | None, rays: _Rays, look: Look, up: np.ndarray 
         depth = rays.spread(distance, np.inf)
         label = np.zeros(len(rays), np.int64)
         label[hit] = surfaces.label[triangle]
-        dark = 1 - look.hollows * _hollows(depth, look.samples)
+        dark = 1 - look.hollows * _hollows(depth, look.reach * look.samples)
         dark *= 1 - look.outline * _edges(depth, rays.spread(label, 0))
         shaded[:, :3] *= dark[rays.wanted][hit, None]
         rgba[hit] = shaded
     return _Near(rgba, distance)
 
 
-def _hollows(depth: np.ndarray, samples: int) -> np.ndarray:
+def _hollows(depth: np.ndarray, sigma: float) -> np.ndarray:
     """Darkness, 0–1, where nearer surfaces are close by in the picture (depth unsharp masking, Luft et al. 2006)."""
     hit = np.isfinite(depth)
     values = depth[hit]
     near, far = float(values.min()), float(values.max())
     filled = np.where(hit, depth, far).astype(np.float32)
-    sigma = 5.0 * samples
     weight = cv2.GaussianBlur(hit.astype(np.float32), (0, 0), sigma)
     blurred = cv2.GaussianBlur(np.where(hit, filled, 0).astype(np.float32), (0, 0), sigma) / np.maximum(weight, 1e-6)
     scale = 0.10 * max(far - near, 1e-6)

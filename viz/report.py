@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -11,23 +12,31 @@ from typing import Literal
 
 import jinja2
 import numpy as np
+from PIL import Image
 
 from geomocap.files.atomic import write_text
-from viz.drawing import jpeg
+from viz.drawing import DENSITY, webp
+from viz.turntable import Turntable
 
 EMBEDDED_VIDEO = 6_000_000
 """Videos up to this many bytes go into the page; larger ones are linked beside it."""
+
+LARGE_PLOT = 80_000
+"""Plots of more bytes are embedded with a small loss."""
 
 
 @dataclass(frozen=True)
 class Block:
     """A piece of a section: text, a picture, a table and so on, as `kind` says."""
 
-    kind: Literal["text", "missing", "heading", "fine", "warnings", "picture", "video", "table", "code"]
+    kind: Literal["text", "missing", "heading", "fine", "warnings", "picture", "turntable", "video", "table", "code"]
     text: str = ""
     title: str = ""
     source: str = ""
     width: int = 0
+    height: int = 0
+    look: Literal["sheet", "plot"] = "sheet"
+    folded: bool = False
     items: tuple[str, ...] = ()
     head: tuple[str, ...] = ()
     rows: tuple[tuple[str, ...], ...] = ()
@@ -52,6 +61,7 @@ class Report:
     lead: str
     key_figures: tuple[tuple[str, str], ...] = ()
     sections: tuple[Section, ...] = ()
+    turntable: Turntable | None = None
     footer: str = field(default="Made by geomocap.")
 
 
@@ -66,20 +76,38 @@ def missing(words: str) -> Block:
 
 
 def picture(image: np.ndarray, title: str, words: str) -> Block:
-    """Return an image (H, W, 3) uint8 with a caption, embedded as JPEG."""
-    return Block("picture", words, title, _data_uri("image/jpeg", jpeg(image)), image.shape[1])
+    """Return an image (H, W, 3) uint8 with a caption, embedded as WebP, `DENSITY` of its pixels a pixel of the page."""
+    height, width = (round(n / DENSITY) for n in image.shape[:2])
+    return Block("picture", words, title, _data_uri("image/webp", webp(image)), width, height)
 
 
 def plot(png: bytes, title: str, words: str) -> Block:
-    """Return a plot with a caption, embedded as PNG."""
-    return Block("picture", words, title, _data_uri("image/png", png))
+    """Return a plot with a caption, embedded as WebP, without loss where that is small."""
+    with Image.open(io.BytesIO(png)) as drawn:
+        image = drawn.convert("RGB")
+    width, height = image.size
+    exact = io.BytesIO()
+    image.save(exact, "WEBP", lossless=True, quality=40, method=2)
+    data = exact.getvalue()
+    if len(data) > LARGE_PLOT:
+        data = min(data, webp(np.asarray(image), 82), key=len)
+    source = _data_uri("image/webp", data)
+    return Block("picture", words, title, source, round(width / DENSITY), round(height / DENSITY), look="plot")
 
 
-def video(file: Path, title: str, words: str) -> Block:
-    """Return a video with a caption: embedded if it is small, otherwise linked by its name beside the page."""
+def turning(still: np.ndarray | None, title: str, words: str) -> Block:
+    """Return the place of the report's turntable, with a picture for browsers that can't draw it."""
+    return Block("turntable", words, title, "" if still is None else _data_uri("image/webp", webp(still)))
+
+
+def video(file: Path, title: str, words: str, folded: bool = False) -> Block:
+    """Return a video with a caption: embedded if it is small, otherwise linked by its name beside the page.
+
+    Folded, a line stands for it until the reader opens it.
+    """
     small = file.stat().st_size <= EMBEDDED_VIDEO
     source = _data_uri("video/mp4", file.read_bytes()) if small else file.name
-    return Block("video", words, title, source)
+    return Block("video", words, title, source, folded=folded)
 
 
 def table(
@@ -89,6 +117,12 @@ def table(
     return Block(
         "table", head=tuple(head), rows=tuple(tuple(r) for r in rows), numbers=tuple(numbers), colors=tuple(colors)
     )
+
+
+@cache
+def _page_part(name: str) -> str:
+    """Text of a file beside the template, as it goes into every page."""
+    return (Path(__file__).parent / "templates" / name).read_text(encoding="utf-8")
 
 
 def _data_uri(kind: str, data: bytes) -> str:
@@ -111,6 +145,10 @@ def render_html(report: Report) -> str:
         key_figures=report.key_figures,
         sections=[s for s in report.sections if s.blocks],
         footer=report.footer,
+        turntable=report.turntable,
+        three=_page_part("three.min.js") if report.turntable else "",
+        script=_page_part("turntable.js") if report.turntable else "",
+        licence=_page_part("three.LICENSE.txt") if report.turntable else "",
     )
 
 

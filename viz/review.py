@@ -20,7 +20,7 @@ from viz.films import motion_video
 from viz.keypoint_marks import marks_of_run
 from viz.matching_review import frame_sheet, template_sheet
 from viz.quality_figures import Quality, assess, relative_paths
-from viz.report import Block, Report, missing, table, text, video, write_report
+from viz.report import Block, Report, missing, table, text, turning, video, write_report
 from viz.run_contents import Results
 from viz.scene import stage as find_stage
 from viz.sections import (
@@ -37,7 +37,14 @@ from viz.sections import (
     title,
     verdict,
 )
+from viz.turntable import Turntable, turntable
 from viz.viewpoints import ViewStage
+
+_HOW = (
+    "Drag to turn, click and scroll or pinch to come nearer, right-drag to shift; space plays, the arrow keys go on by "
+    "single frames. Point at a body or joint to read its name, how far it has turned since the first frame, and its "
+    "confidence; click it to keep that in view."
+)
 
 _FOLLOWED = {
     "patches": "patches of the images",
@@ -100,15 +107,15 @@ def review(
         stage = find_stage(results)
     except GeometryError:
         stage = None
-    desk = Desk(run.path / "review", progress, 27)
+    desk = Desk(run.path / "review", progress, 28)
     progress("review", 0, desk.total)
     quality = assess(results, chosen)
     desk.step()
+    turns = None if stage is None else turntable(results, stage)
+    desk.step()
+    head = [*changed_files(results), *verdict(results), *summary(quality)]
     parts = [
-        section(
-            "Result",
-            [*changed_files(results), *verdict(results), *summary(quality), *_result(results, stage, chosen, desk)],
-        ),
+        section("Result", [*head, *_result(results, stage, chosen, turns, desk)]),
         section("What went in", _inputs(results, stage, chosen, desk)),
         section("Silhouettes", _silhouettes(results, quality, chosen, desk)),
         section("Volume and points", _volume(results, stage, chosen, desk)),
@@ -124,22 +131,27 @@ def review(
         section("Settings and versions", record_blocks(results)),
     ]
     page = desk.folder / "report.html"
-    write_report(page, Report(title(results), lead(results), key_figures(results), tuple(parts)))
+    write_report(page, Report(title(results), lead(results), key_figures(results), tuple(parts), turns))
     progress("review", desk.total, desk.total)
     return [*desk.written, page]
 
 
-def _result(results: Results, stage: ViewStage | None, frames: list[int], desk: Desk) -> list[Block]:
+def _result(
+    results: Results, stage: ViewStage | None, frames: list[int], turns: Turntable | None, desk: Desk
+) -> list[Block]:
     if stage is None:
         return [missing("The run holds no geometry yet, so there is no result to show; the silhouettes are below.")]
-    blocks = []
+    blocks: list[Block] = []
+    if turns is not None:
+        blocks.append(turning(sheets.still(results, stage, frames[len(frames) // 2]), "The subject", _HOW))
     if len(results.frames) > 1:
         path = desk.folder / "motion.mp4"
         motion_video(results, stage, path, progress=desk.progress)
         desk.written.append(path)
         over = ", and over the image of one camera" if _calibrated(results) else ""
         words = "Look for limbs that keep their colour, joints that stay inside the volume, and bones that don't jump."
-        blocks.append(video(path, "The motion", f"From a slowly turning free view{over}. {words}"))
+        told = f"From a slowly turning free view{over}. {words}"
+        blocks.append(video(path, "The motion", told, folded=turns is not None))
     desk.step()
     rows: list[tuple[str, sheets.Builder]] = []
     if {"voxels", "cloud"} & set(results.kinds):

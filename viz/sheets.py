@@ -9,7 +9,7 @@ import numpy as np
 from geomocap.scheduling import map_items, threads
 from viz import body_colors as palette
 from viz import scene
-from viz.drawing import faded, fit, outlined, resize, sheet, write_on
+from viz.drawing import DENSITY, faded, fit, outlined, resize, sheet, write_on
 from viz.floor import floor
 from viz.rendering import Look, Model, render
 from viz.run_contents import Results
@@ -18,6 +18,9 @@ from viz.viewpoints import PinholeView, ViewStage, camera_view
 
 VIEWS = {"three-quarter": (35.0, 15.0), "broad side": (0.0, 5.0), "narrow side": (90.0, 5.0), "top": (0.0, 80.0)}
 """Free views: azimuth and elevation, degrees. Broad and narrow refer to the subject, whatever it is."""
+
+FINE = Look(samples=1, reach=5.0 * DENSITY)
+"""How sheets are drawn: so many pixels need no more rays."""
 
 Builder = Callable[[Results, int], list[Mesh]]
 
@@ -29,7 +32,9 @@ def chosen_frames(frames: Sequence[int], count: int) -> list[int]:
     return [frames[round(p)] for p in np.linspace(0, len(frames) - 1, count)]
 
 
-def tile_size(stage: ViewStage, azimuth_deg: float, elevation_deg: float, area: float = 85_000) -> tuple[int, int]:
+def tile_size(
+    stage: ViewStage, azimuth_deg: float, elevation_deg: float, area: float = 85_000 * DENSITY**2
+) -> tuple[int, int]:
     """Return the width and height of a picture that suits what a view sees, about `area` pixels large."""
     view = stage.view(azimuth_deg, elevation_deg, (1000, 1000))
     pixels, _ = view.project(stage.points + stage.centers[0])
@@ -39,13 +44,13 @@ def tile_size(stage: ViewStage, azimuth_deg: float, elevation_deg: float, area: 
 
 
 def picture(
-    results: Results, stage: ViewStage, model: Model, view: PinholeView, frame: int, look: Look | None = None
+    results: Results, stage: ViewStage, model: Model, view: PinholeView, frame: int, look: Look = FINE
 ) -> np.ndarray:
-    """Return a free view of a model on the floor, (H, W, 3) uint8."""
+    """Return a free view of a model on the floor, (H, W, 4) uint8: RGB and opacity."""
     place = results.place(frame)
     moved = stage.at(view, place)
     center = stage.centers[min(place, len(stage.centers) - 1)]
-    return model.render(moved, look, stage.up).over(floor(stage, moved, model.meshes, center))
+    return model.render(moved, look, stage.up).above(floor(stage, moved, model.meshes, center)).clear()
 
 
 def volume_meshes(results: Results, frame: int) -> list[Mesh]:
@@ -93,10 +98,17 @@ def geometry_sheet(
     return sheet([list(row) for row in zip(*columns, strict=True)], views, labels)
 
 
+def still(results: Results, stage: ViewStage, frame: int, size: tuple[int, int] = (1440, 900)) -> np.ndarray:
+    """Return one picture of the skeleton inside the translucent volume, where nothing can be turned."""
+    azimuth, elevation = VIEWS["three-quarter"]
+    model = Model(skeleton_meshes(results, frame))
+    return picture(results, stage, model, stage.view(azimuth, elevation, size), frame)
+
+
 def path_sheet(results: Results, stage: ViewStage, frame: int) -> np.ndarray:
     """Return the paths of the whole sequence, views beside each other, with the volume of one frame as glass."""
     model = Model(path_meshes(results, frame))
-    seen_from = [stage.view(*angles, tile_size(stage, *angles, 130_000)) for angles in VIEWS.values()]
+    seen_from = [stage.view(*angles, tile_size(stage, *angles, 130_000 * DENSITY**2)) for angles in VIEWS.values()]
     return sheet([[picture(results, stage, model, view, frame) for view in seen_from]], (), tuple(VIEWS))
 
 
@@ -115,7 +127,7 @@ def story_sheet(
     return sheet([list(r) for r in zip(*columns, strict=True)], [n for n, _ in rows], [f"frame {f}" for f in frames])
 
 
-def silhouette_sheet(results: Results, frames: Sequence[int], width: int = 250) -> np.ndarray | None:
+def silhouette_sheet(results: Results, frames: Sequence[int], width: int = 250 * DENSITY) -> np.ndarray | None:
     """Return the silhouettes of all cameras, drawn over the images where the capture is at hand; None without any."""
     cameras = results.silhouette_cameras
     if not cameras or not frames:
@@ -136,8 +148,9 @@ def silhouette_sheet(results: Results, frames: Sequence[int], width: int = 250) 
                 below = np.full((size[1], size[0], 3), 245, np.uint8)
             drawn = outlined(below, mask, (214, 40, 90), 0.30)
             covered = 100 * float((mask > 127).mean())
+            corner = (6 * DENSITY, size[1] - 6 * DENSITY)
             pictures.append(
-                write_on(drawn, f"{covered:.1f} %", (6, size[1] - 6), 11, anchor="lb", plate=(255, 255, 255))
+                write_on(drawn, f"{covered:.1f} %", corner, 11 * DENSITY, anchor="lb", plate=(255, 255, 255))
             )
         return pictures
 
@@ -156,18 +169,24 @@ def silhouette_sheet(results: Results, frames: Sequence[int], width: int = 250) 
 
 
 def _named(image: np.ndarray, name: str) -> np.ndarray:
-    return write_on(image, name, (7, 7), 12, bold=True, plate=(255, 255, 255))
+    return write_on(image, name, (7 * DENSITY, 7 * DENSITY), 12 * DENSITY, bold=True, plate=(255, 255, 255))
 
 
 def overlay(
-    results: Results, camera: str, frame: int, model: Model, longest_side: int = 420, opacity: float = 0.85
+    results: Results,
+    camera: str,
+    frame: int,
+    model: Model,
+    longest_side: int = 420,
+    opacity: float = 0.85,
+    look: Look | None = None,
 ) -> np.ndarray:
     """Return a model drawn over a camera's image, distortion included: (H, W, 3) uint8."""
     capture = results.capture
     assert capture is not None
     view = camera_view(capture.rig, capture.rig.names.index(camera), longest_side)
     photograph = resize(capture.frame(camera, frame), view.size)
-    return model.render(view).over(faded(photograph, 0.35), opacity)
+    return model.render(view, look).over(faded(photograph, 0.35), opacity)
 
 
 def overlay_sheet(
@@ -182,7 +201,7 @@ def overlay_sheet(
 
     def tile(job: tuple[str, int]) -> np.ndarray:
         camera, frame = job
-        drawn = overlay(results, camera, frame, built[frame], 340, opacity)
+        drawn = overlay(results, camera, frame, built[frame], 340 * DENSITY, opacity, FINE)
         return _named(drawn, camera if len(frames) == 1 else f"{camera}, frame {frame}")
 
     with threads() as executor:
@@ -192,7 +211,7 @@ def overlay_sheet(
 
 
 def cameras_picture(
-    results: Results, stage: ViewStage, frame: int, size: tuple[int, int] = (900, 560)
+    results: Results, stage: ViewStage, frame: int, size: tuple[int, int] = (900 * DENSITY, 560 * DENSITY)
 ) -> np.ndarray | None:
     """Return the cameras around the subject with their names; None without a calibrated capture."""
     capture = results.capture
@@ -208,14 +227,15 @@ def cameras_picture(
     wide = ViewStage(everything - target, target[None], stage.up, stage.broad, stage.floor)
     view = wide.view(25.0, 32.0, size, 30.0)
     body = scene.body_skin(results, frame)
-    image = render([body, *wires], view, None, stage.up).over(floor(wide, view, [body]))
+    image = render([body, *wires], view, FINE, stage.up).above(floor(wide, view, [body])).clear()
     pixels, _ = view.project(rig.centers)
     for name, (x, y) in zip(rig.names, pixels, strict=True):
-        image = write_on(image, name, (float(x), float(y) - 12), 13, palette.INK, anchor="mb", plate=(255, 255, 255))
+        at = (float(x), float(y) - 12 * DENSITY)
+        image = write_on(image, name, at, 13 * DENSITY, palette.INK, anchor="mb", plate=(255, 255, 255))
     return image
 
 
-def camera_images(results: Results, frame: int, width: int = 230) -> np.ndarray | None:
+def camera_images(results: Results, frame: int, width: int = 230 * DENSITY) -> np.ndarray | None:
     """Return one photograph of each camera; None without a capture."""
     capture = results.capture
     if capture is None:

@@ -10,8 +10,8 @@ import matplotlib
 import numpy as np
 
 from geomocap.model.trajectories import Tracks
-from viz.body_colors import ACCENT, INK
-from viz.drawing import faded, resize, sheet, write_on
+from viz.body_colors import ACCENT
+from viz.drawing import DENSITY, FAINT, faded, resize, sheet, write_on
 from viz.run_contents import Results
 from viz.viewpoints import View, ViewStage, camera_view
 
@@ -20,13 +20,14 @@ REMOVED = (200, 30, 50)
 
 _TRAIL = 12  # frames of a trajectory that are drawn
 _ARROW = 0.1  # s of motion that an arrow stands for
-_CELL = 9  # px; in a cell of the picture only the nearest points are drawn
+_CELL = 9 * DENSITY  # px; in a cell of the picture only the nearest points are drawn
 _BEHIND = 0.06  # m behind the nearest one is hidden
 _ARROWS = 450
+_CORNER = (7 * DENSITY, 7 * DENSITY)
 
 
 def trajectory_sheet(
-    results: Results, stage: ViewStage, tracks: Tracks, frames: Sequence[int], longest_side: int = 560
+    results: Results, stage: ViewStage, tracks: Tracks, frames: Sequence[int], longest_side: int = 560 * DENSITY
 ) -> np.ndarray | None:
     """Draw the trajectories of the last frames before each of `frames`, coloured by displacement: (H, W, 3) uint8."""
     trails = [_trail(tracks.trajectories.positions, results.place(f)) for f in frames]
@@ -36,12 +37,12 @@ def trajectory_sheet(
         canvas, view = _background(results, stage, tracks, frame, longest_side)
         which, shift = _displacement(trail)
         canvas = _draw_trails(canvas, view, trail[which], _colors(shift / top))
-        row.append(write_on(canvas, f"frame {frame}", (7, 7), 13, bold=True, plate=(255, 255, 255)))
+        row.append(write_on(canvas, f"frame {frame}", _CORNER, 13 * DENSITY, bold=True, plate=(255, 255, 255)))
     return _with_scale(sheet([row], framed=True), f"displacement over {_TRAIL} frames", 1000 * top, "mm")
 
 
 def velocity_sheet(
-    results: Results, stage: ViewStage, tracks: Tracks, frames: Sequence[int], longest_side: int = 560
+    results: Results, stage: ViewStage, tracks: Tracks, frames: Sequence[int], longest_side: int = 560 * DENSITY
 ) -> np.ndarray | None:
     """Draw velocities as arrows, coloured by speed: (H, W, 3) uint8."""
     speeds = [np.linalg.norm(tracks.motion.velocities[:, results.place(f)], axis=1) for f in frames]
@@ -59,14 +60,14 @@ def velocity_sheet(
         (a, _), (b, _) = view.project(start), view.project(end)
         for p, q, color in zip(a, b, colors, strict=True):
             if np.isfinite([p, q]).all():
-                tip = 4.0 / max(float(np.linalg.norm(q - p)), 4.0)
-                cv2.arrowedLine(canvas, _pixel(p), _pixel(q), color, 1, cv2.LINE_AA, tipLength=tip)
-        row.append(write_on(canvas, f"frame {frame}", (7, 7), 13, bold=True, plate=(255, 255, 255)))
+                tip = 4.0 * DENSITY / max(float(np.linalg.norm(q - p)), 4.0 * DENSITY)
+                cv2.arrowedLine(canvas, _pixel(p), _pixel(q), color, DENSITY, cv2.LINE_AA, tipLength=tip)
+        row.append(write_on(canvas, f"frame {frame}", _CORNER, 13 * DENSITY, bold=True, plate=(255, 255, 255)))
     return _with_scale(sheet([row], framed=True), f"speed; arrows show {_ARROW:g} s of motion", top, "m/s")
 
 
 def filter_sheet(
-    results: Results, stage: ViewStage, tracks: Tracks, frame: int, longest_side: int = 760
+    results: Results, stage: ViewStage, tracks: Tracks, frame: int, longest_side: int = 760 * DENSITY
 ) -> np.ndarray | None:
     """Draw the trajectories round a frame without filters, what they cut or remove in red, and with them."""
     if tracks.unfiltered is None or tracks.kept is None:
@@ -87,7 +88,7 @@ def filter_sheet(
         words = f"{name}: {int(measured.sum())} points" + (
             f", {int(bad.sum())} cut or removed here" if bad.any() else ""
         )
-        tiles.append(write_on(canvas, words, (7, 7), 13, bold=True, plate=(255, 255, 255)))
+        tiles.append(write_on(canvas, words, _CORNER, 13 * DENSITY, bold=True, plate=(255, 255, 255)))
     return sheet([tiles], framed=True)
 
 
@@ -163,11 +164,11 @@ def _draw_trails(
     drawn = np.isfinite(pixels[:, :, 0]) & np.isfinite(pixels[:, :, 1])
     for n in show.tolist():
         points = np.round(8 * (pixels[n, drawn[n]] - 0.5)).astype(np.int32)
-        cv2.polylines(canvas, [points], False, colors[n], 1, cv2.LINE_AA, shift=3)
+        cv2.polylines(canvas, [points], False, colors[n], DENSITY, cv2.LINE_AA, shift=3)
     ends, _ = view.project(last)
     for n in show.tolist():
         if np.isfinite(ends[n]).all():
-            cv2.circle(canvas, _pixel(ends[n]), 1, colors[n], -1, cv2.LINE_AA)
+            cv2.circle(canvas, _pixel(ends[n]), DENSITY, colors[n], -1, cv2.LINE_AA)
     return canvas
 
 
@@ -200,11 +201,14 @@ def _colors(fractions: np.ndarray) -> list[tuple[int, int, int]]:
 
 def _with_scale(image: np.ndarray, words: str, top: float, unit: str) -> np.ndarray:
     """Put a colour scale below a picture."""
-    strip = np.full((34, image.shape[1], 3), 255, np.uint8)
-    length = min(240, image.shape[1] // 3)
-    strip[11:23, 50 : 50 + length] = np.array(_colors(np.linspace(0, 1, length)), np.uint8)[None]
-    strip = write_on(strip, "0", (40, 17), 12, INK, anchor="rm")
-    strip = write_on(strip, f"{top:.3g} {unit}  {words}", (58 + length, 17), 12, INK, anchor="lm")
+    d = DENSITY
+    strip = np.empty((34 * d, image.shape[1], 4), np.uint8)
+    strip[:] = (*FAINT, 0)
+    length = min(240 * d, image.shape[1] // 3)
+    strip[11 * d : 23 * d, 50 * d : 50 * d + length, :3] = np.array(_colors(np.linspace(0, 1, length)), np.uint8)[None]
+    strip[11 * d : 23 * d, 50 * d : 50 * d + length, 3] = 255
+    strip = write_on(strip, "0", (40 * d, 17 * d), 12 * d, FAINT, anchor="rm")
+    strip = write_on(strip, f"{top:.3g} {unit}  {words}", (58 * d + length, 17 * d), 12 * d, FAINT, anchor="lm")
     return np.concatenate([image, strip])
 
 

@@ -54,6 +54,10 @@ COMMANDS = {
         "keypoint_command.keypoints",
         "Follow key-points on the surface, given as `[[keypoint]]` tables: name, center (m), radius (m), frame.",
     ),
+    "view": (
+        "view_command.view",
+        "Look at a run, capture, scans, calibration or motion file in the browser; needs the extra view.",
+    ),
     "export": (
         "export_command.export",
         "Write motion files of a run for Blender, OpenSim, C3D tools, game engines and plots.",

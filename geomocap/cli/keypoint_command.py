@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Annotated
 
@@ -54,14 +53,14 @@ def keypoints(
     opened = existing_run(run)
     tell_faults(opened)
     if edit:
-        _edit(opened, file, host, port, wait)
+        edit_keypoints(opened, file, host, port, wait)
         return
     wanted = read_keypoints(file)
     with working(run, wait):
         _report(opened, wanted, follow_keypoints(opened, wanted))
 
 
-def _edit(run: Run, file: Path, host: str, port: int, wait: bool) -> None:
+def edit_keypoints(run: Run, file: Path, host: str, port: int, wait: bool) -> None:
     """Serve the editor until the user interrupts it; save when asked to."""
     from viz.keypoint_editor import KeyPointEditor
     from viz.keypoint_scene import Subject
@@ -89,8 +88,6 @@ def _edit(run: Run, file: Path, host: str, port: int, wait: bool) -> None:
         _report(run, wanted, found)
         return f"Saved {', '.join(p.name for p in (file, *found.files))}."
 
-    # browsers open connections ahead that they never use, which isn't worth a traceback
-    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     editor = KeyPointEditor(subject, Follower(Measured.of(tracks)), Session.open(begun), save, host, port)
     console.print(f"editor: {editor.url} (stop with Ctrl+C)", markup=False)
     try:

@@ -35,7 +35,7 @@ def test_page_and_pictures(calibrations: list[Calibration], which: int, tmp_path
     for name in calibration.rig.names:
         assert f"{name}</td>" in words
     assert ("was moved between frames" in words) == (which == 0)
-    assert 'src="http' not in words and words.count("data:image/png") == 4
+    assert 'src="http' not in words and words.count("data:image/webp") == 4
     for name in ("layout", "residuals", "coverage", "lengths"):
         picture = cv2.imread(str(page.parent / f"{name}.png"))
         assert picture is not None and min(picture.shape[:2]) > 300

@@ -23,7 +23,7 @@ def test_page_of_a_synthetic_truth(run_and_truth, tmp_path):
     for name, value in result.rounded().items():
         assert f"<td>{name.replace('&', '&amp;')}</td>" in page
         assert f"{value:g}</td>" in page
-    assert len(re.findall(r'src="data:image/png;base64,', page)) == 5  # summaries, joints, bodies, two pictures
+    assert len(re.findall(r'src="data:image/webp;base64,', page)) == 6  # summaries, joints, bodies, three pictures
     assert "http://" not in page and "https://" not in page
     assert not re.search(r'src="(?!data:)', page)
 

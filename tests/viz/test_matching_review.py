@@ -60,7 +60,7 @@ def test_template_sheet_shows_three_pictures(measured) -> None:
     picture = template_sheet(image, frame.templates[0], 300)
     assert picture.dtype == np.uint8 and picture.shape[1] > 900
     # Regions differ in colour
-    assert len(np.unique(picture[:, 310:600].reshape(-1, 3), axis=0)) > 100
+    assert len(np.unique(picture[:, 330:600].reshape(-1, 4), axis=0)) > 100
 
 
 def test_cloud_is_drawn_from_its_side() -> None:

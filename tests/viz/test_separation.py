@@ -54,7 +54,7 @@ def test_alternatives_show_other_numbers_of_bodies_only(followed: Run) -> None:
     assert both is not None and single is not None
     assert both.shape[1] > 1.8 * single.shape[1]  # the alternative with as many bodies is not drawn again
     unlike = body_colors(np.array([7]))[0]  # a body that only the finer of the two has
-    hits = np.abs(both.astype(int) - unlike).max(axis=2) < 12
+    hits = np.abs(both[..., :3].astype(int) - unlike).max(axis=2) < 12
     half = both.shape[1] // 2
     assert hits[:, :half].sum() > 0
     assert hits[:, half:].sum() < 0.2 * hits[:, :half].sum()

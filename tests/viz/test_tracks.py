@@ -45,7 +45,7 @@ def tracked(made: Made, tmp_path: Path) -> Run:
 
 
 def reds(image: np.ndarray) -> int:
-    return int((np.abs(image.astype(int) - RED).max(axis=2) < 40).sum())
+    return int((np.abs(image[..., :3].astype(int) - RED).max(axis=2) < 40).sum())
 
 
 def test_removed_points_are_red_without_filters_only(made: Made, tracked: Run) -> None:

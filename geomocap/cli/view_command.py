@@ -1,0 +1,69 @@
+"""The command `geomocap view`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from geomocap.cli.arguments import Workers
+from geomocap.cli.console import console
+from geomocap.cli.reports import capture_of, existing_run
+from geomocap.cli.settings_options import with_file_of_options
+from geomocap.files.run import Run
+
+
+@with_file_of_options
+def view(
+    path: Annotated[
+        Path, typer.Argument(metavar="PATH", help="Run, capture, scans, calibration or motion file (BVH, TRC, C3D).")
+    ],
+    other: Annotated[
+        Path | None, typer.Argument(metavar="OTHER", help="Another one, shown beside it on the same time line.")
+    ] = None,
+    keypoints: Annotated[
+        bool, typer.Option("--keypoints", help="Place and move key-points of a run, as `geomocap keypoints --edit`.")
+    ] = False,
+    host: Annotated[
+        str, typer.Option("--host", help="Address that the page listens on; others than this one let others in.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option("--port", min=1, max=65535, help="Port of the page; the next free one if it is taken.")
+    ] = 8080,
+    rerun: Annotated[
+        Path | None,
+        typer.Option("--rerun", metavar="FILE.rrd", help="Write a Rerun recording instead; needs the extra rerun."),
+    ] = None,
+    workers: Workers = None,
+) -> None:
+    """Look at a run, capture, scans, calibration or motion file in the browser; needs the extra view.
+
+    Bodies, joints and markers that are clicked tell their name, angle and confidence. New names of a run's bodies and
+    joints are written to RUN/names.toml.
+    """
+    if keypoints:
+        from geomocap.cli.keypoint_command import edit_keypoints
+
+        edit_keypoints(existing_run(path), path / "keypoints.toml", host, port, wait=False)
+        return
+    from viz.view_content import open_content
+    from viz.viewer import Viewer
+
+    contents = [
+        open_content(p, capture_of(Run(p)) if (p / "run.toml").is_file() else None)
+        for p in (path, other)
+        if p is not None
+    ]
+    if rerun is not None:
+        from viz.rerun_recording import write_recording
+
+        write_recording(rerun, contents)
+        console.print(f"recording: {rerun}", markup=False)
+        return
+    viewer = Viewer(contents, host, port)
+    console.print(f"viewer: {viewer.url} (stop with Ctrl+C)", markup=False)
+    try:
+        viewer.serve()
+    except KeyboardInterrupt:
+        console.print("stopped")
