@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from data_tools.image_sizes import SizeMismatch, find_fit, refit_camera
 from data_tools.plates import compose_plate
 from data_tools.synthesize import write_png
 from geomocap.errors import CalibrationError, CaptureError, GeomocapError
-from geomocap.files.atomic import write_atomic
+from geomocap.files.atomic import copy_whole
 from geomocap.files.capture import Capture, CaptureInfo, write_capture_info
 from geomocap.files.images import IMAGE_ENDINGS, read_image
 from geomocap.files.rigs import read_rig, write_rig
@@ -105,7 +104,7 @@ def import_pose2sim(
             )
         cameras.append(camera)
         target = capture / "videos" / f"{name}{file.suffix.lower()}"
-        write_atomic(target, lambda p, file=file: shutil.copyfile(file, p))  # type: ignore[misc]
+        copy_whole(file, target)
     progress("videos", len(files), len(files))
     rig = Rig(rig.names, tuple(cameras), np.array(rig.cam_from_world))
     write_rig(capture / "sparse", rig)
@@ -166,7 +165,7 @@ def import_colmap(
         for t, file in enumerate(files):
             target = capture / "images" / name / f"{t:06d}{file.suffix.lower()}"
             if file.suffix.lower() in IMAGE_ENDINGS:
-                write_atomic(target, lambda p, file=file: shutil.copyfile(file, p))  # type: ignore[misc]
+                copy_whole(file, target)
             else:  # other formats are stored anew, without loss
                 write_png(target.with_suffix(".png"), read_image(file))
     progress("images", len(rig), len(rig))

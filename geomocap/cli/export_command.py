@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from geomocap.cli.arguments import Workers
+from geomocap.cli.arguments import Wait, Workers
 from geomocap.cli.console import console
 from geomocap.cli.progress_bars import progress_bars
+from geomocap.cli.reports import existing_run, tell_faults, working
 from geomocap.cli.settings_options import with_settings
 from geomocap.config import Config
 from geomocap.export.run_export import Exported, export_run
 from geomocap.files.atomic import write_atomic
-from geomocap.files.run import Run
 from viz.angle_plots import angle_sheet
 
 
@@ -41,6 +42,7 @@ def export(
         Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; RUN if not given.")
     ] = None,
     workers: Workers = None,
+    wait: Wait = False,
 ) -> None:
     """Write motion files of a run for Blender, OpenSim, C3D tools, game engines and plots.
 
@@ -54,11 +56,15 @@ def export(
     settings = config.export
     if with_skin:
         settings = settings.model_copy(update={"surface": "skin"})
-    with progress_bars() as progress:
-        exported = export_run(Run(run), formats, settings, folder=out, progress=progress)
-    if angles and exported.angles is not None and exported.angles.names:
-        picture = angle_sheet(exported.angles)
-        write_atomic(exported.files["angles"].with_suffix(".png"), lambda p: p.write_bytes(picture))
+    opened = existing_run(run)
+    with working(run, wait) if out is None else nullcontext(), progress_bars() as progress:
+        tell_faults(opened)
+        exported = export_run(opened, formats, settings, folder=out, progress=progress)
+        if angles and exported.angles is not None and exported.angles.names:
+            picture = angle_sheet(exported.angles)
+            write_atomic(exported.files["angles"].with_suffix(".png"), lambda p: p.write_bytes(picture))
+        if out is None:
+            opened.renew("export", exported.files.values())
     report_exported(exported)
 
 

@@ -35,7 +35,7 @@ from geomocap.export.tables import motion_table, write_csv, write_parquet
 from geomocap.export.trc import write_trc
 from geomocap.export.urdf import URDF, write_urdf
 from geomocap.export.usd import write_usd
-from geomocap.files.atomic import write_text
+from geomocap.files.atomic import remove_remains, write_text
 from geomocap.files.results import ELLIPSOIDS, KEYPOINTS, read_ellipsoids, read_keypoint_paths, read_skeleton
 from geomocap.files.run import Run
 from geomocap.model.skeleton import Skeleton
@@ -151,6 +151,7 @@ def export_run(
         "fbx": lambda path: _write_fbx(path, shown, skinned),
         "movement": lambda path: write_movement(path, markers),
     }
+    remove_remains([folder or run.path])
     files, skipped = {}, {}
     chosen = list(formats) if formats is not None else [name for name in FILES if name not in ON_REQUEST]
     for k, name in enumerate(chosen):
@@ -163,8 +164,11 @@ def export_run(
                 raise
             skipped[name] = str(error)
         progress("export", k + 1, len(chosen))
+    listed = (folder or run.path) / NAMES_FOUND
     if found.template is not None:
-        write_text((folder or run.path) / NAMES_FOUND, names_text(found))
+        write_text(listed, names_text(found))
+    else:
+        listed.unlink(missing_ok=True)
     shifting = tuple(n for n, m, j in zip(motion.names, motion.moving, motion.joints, strict=True) if m and j >= 0)
     return Exported(files, skipped, motion.largest_deviation_mm(skeleton.joint_positions), shifting, found, angles)
 
