@@ -31,7 +31,7 @@ def read_colmap(folder: Path, metres_per_unit: float = 1.0) -> Rig:
     rig = read_rig(model)
     poses = np.array(rig.cam_from_world)
     poses[:, :, 3] = in_metres(poses[:, :, 3], metres_per_unit, str(model))
-    rig = Rig(rig.names, rig.cameras, poses)
+    rig = Rig.of_file(str(model), rig.names, rig.cameras, poses, rig.notes)
     check_rig(rig, str(model))
     return rig
 

@@ -16,6 +16,9 @@ from geomocap.cli.settings_options import with_settings
 from geomocap.config import Config
 from geomocap.export.run_export import Exported, export_run
 from geomocap.files.atomic import write_atomic
+from geomocap.files.result_schemas import skeleton_gaps
+from geomocap.files.results import read_skeleton
+from geomocap.files.run import Run
 from viz.angle_plots import angle_sheet
 
 
@@ -66,6 +69,8 @@ def export(
         if out is None:
             opened.renew("export", exported.files.values())
     report_exported(exported)
+    for gap in skeleton_gaps(read_skeleton(Run(run))):
+        console.print(f"note: {gap}")
 
 
 def report_exported(exported: Exported) -> None:

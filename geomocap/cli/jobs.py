@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from geomocap.cli.execution import executor_for
 from geomocap.cli.progress_bars import progress_bars
 from geomocap.cli.reports import tell_note, working
 from geomocap.config import Config
-from geomocap.errors import RunError
+from geomocap.errors import GeomocapError, RunError
 from geomocap.files.capture import Capture
 from geomocap.files.run import Run
 from geomocap.files.scans import open_scans
@@ -36,6 +36,9 @@ def capture_job(
     opened = Capture.open(capture)
     _check_apart(capture, run)
     _check_model(model, run)
+    with suppress(GeomocapError):  # what is wrong with the cameras, the stages that need them say
+        for note in opened.rig.notes:
+            tell_note(note)
     with working(run, wait), executor_for(workers, scheduler) as executor, progress_bars() as progress:
         yield Job(Run(run), config, executor, progress, capture=opened, fps=opened.fps, model=model, tell=tell_note)
 

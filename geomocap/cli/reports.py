@@ -12,7 +12,7 @@ from geomocap.cli.console import console
 from geomocap.errors import GeomocapError, RunError
 from geomocap.files.atomic import fingerprint
 from geomocap.files.capture import Capture
-from geomocap.files.results import read_cloud_record
+from geomocap.files.results import read_cloud_record, read_warnings
 from geomocap.files.run import Run, stage_key
 from geomocap.files.run_lock import working_in
 from geomocap.files.stage_records import listed_faults
@@ -91,7 +91,9 @@ def capture_of(run: Run) -> Capture | None:
 
 
 def tell_results(run: Path) -> None:
-    """Print where the results are."""
+    """Print what is doubtful, and where the results are."""
+    for warning in read_warnings(Run(run)):
+        console.print(f"warning: {warning}")
     for what, file in (("motion", "motion.bvh"), ("report", "review/report.html")):
         if (run / file).exists():
             console.print(f"{what}: {run / file}", markup=False)

@@ -13,8 +13,9 @@ import typer
 from geomocap.cli.arguments import CaptureFolder, ModelFile, Pictures, RunFolder, Scheduler, Wait, Workers
 from geomocap.cli.settings_options import with_settings
 from geomocap.config import Config
+from geomocap.settings import LEAST_FPS, MOST_FPS
 
-Fps = Annotated[float, typer.Option("--fps", min=0.001, help="Scans per second.")]
+Fps = Annotated[float, typer.Option("--fps", min=LEAST_FPS, max=MOST_FPS, help="Scans per second.")]
 BODIES = ("segmentation", "skeleton", "nodes", "motion_bodies", "motion_skeleton", "refinement", "following")
 
 

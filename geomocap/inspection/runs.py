@@ -23,6 +23,7 @@ from geomocap.files.results import (
 )
 from geomocap.files.run import Run
 from geomocap.inspection.description import Description, count, shortened
+from geomocap.subject.subject_model import MODEL_FILE, read_model
 
 
 def describe_run(path: Path) -> Description:
@@ -50,7 +51,14 @@ def describe_run(path: Path) -> Description:
                 told.problem(
                     f"{kind}/ lacks {count(len(missing), 'frame')} from {missing[0]:06d} on; start the run again"
                 )
-    for name, tell in ((ELLIPSOIDS, _ellipsoids), (SKELETON, _skeleton), (TRACKS, _tracks), (KEYPOINTS, _keypoints)):
+    kinds = (
+        (ELLIPSOIDS, _ellipsoids),
+        (SKELETON, _skeleton),
+        (TRACKS, _tracks),
+        (KEYPOINTS, _keypoints),
+        (MODEL_FILE, _model),
+    )
+    for name, tell in kinds:
         if run.has(name):
             try:
                 tell(run, told)
@@ -85,6 +93,14 @@ def _skeleton(run: Run, told: Description) -> None:
         told.problem("body rotations hold NaN; files turn evenly across them")
     elif np.abs(rotations[0] - np.eye(3)).max() > 1e-3:
         told.problem("body rotations don't begin at the identity: they aren't rotations since the first frame")
+
+
+def _model(run: Run, told: Description) -> None:
+    model = read_model(run.path / MODEL_FILE)
+    bodies = count(model.body_count, "body", "bodies")
+    told.fact(
+        "subject's model", f"{count(len(model.points), 'surface point')} on {bodies}, {model.diagonal:.2f} m across"
+    )
 
 
 def _tracks(run: Run, told: Description) -> None:
