@@ -164,8 +164,11 @@ def export_run(
                 raise
             skipped[name] = str(error)
         progress("export", k + 1, len(chosen))
+    listed = (folder or run.path) / NAMES_FOUND
     if found.template is not None:
-        write_text((folder or run.path) / NAMES_FOUND, names_text(found))
+        write_text(listed, names_text(found))
+    else:
+        listed.unlink(missing_ok=True)
     shifting = tuple(n for n, m, j in zip(motion.names, motion.moving, motion.joints, strict=True) if m and j >= 0)
     return Exported(files, skipped, motion.largest_deviation_mm(skeleton.joint_positions), shifting, found, angles)
 

@@ -15,11 +15,20 @@ import numpy as np
 from geomocap.model.skeleton import Skeleton
 from geomocap.naming.mean_posture import BodySurface, MeanPosture, mean_posture
 from geomocap.naming.name_templates import SIDES, NameTemplate, read_template
-from geomocap.naming.tree_matching import SURE, TreeMatch, body_places, decoy_score, match_tree, part_places
+from geomocap.naming.tree_matching import (
+    SURE,
+    TreeMatch,
+    body_places,
+    decoy_score,
+    match_tree,
+    part_places,
+    perfect_gain,
+)
 
 LIKELY = 0.7  # a name is given
 CERTAIN = 0.9  # left and right are told
 AUTOMATIC = ("human", "quadruped", "bird")  # a hand may lie anyhow; with few joints most trees would fit it
+FITS = 0.5  # share of a perfect subject's score that a tree must have for each of its joints
 FAR = 3.0  # standard deviations within which a body lies
 MOST_WORDS = 3  # of parts in one body's name
 
@@ -94,7 +103,11 @@ def find_names(
         return FoundNames(scores=scores)
     others = [0.0, *(score for name, score in scores.items() if name != best[0].name)]
     score = best[1][0].score
-    if len(asked) > 1 and (score - max(others) < SURE or decoy_score(posture, best[0], score - SURE) > score - SURE):
+    if len(asked) > 1 and (
+        score < FITS * perfect_gain(best[0]) * skeleton.joint_count
+        or score - max(others) < SURE
+        or decoy_score(posture, best[0], score - SURE) > score - SURE
+    ):
         return FoundNames(scores=scores)
     return _names(posture, best[0], best[1], scores)
 

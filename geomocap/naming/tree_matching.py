@@ -158,6 +158,17 @@ def _best_score(tree: PosedTree, template: NameTemplate, tilt: np.ndarray, least
     return least
 
 
+def perfect_gain(template: NameTemplate) -> float:
+    """Mean score of a joint of a subject that is exactly as a template.
+
+    Parameters
+    ----------
+    template : NameTemplate
+    """
+    model = _template_model(template)
+    return float(_gains(model.features, model, np.eye(3)).diagonal().mean())
+
+
 def part_places(template: NameTemplate) -> tuple[np.ndarray, np.ndarray]:
     """Centres of a template's parts, (K, 3), from the middle of all, and how far they stray, (K, 3).
 
