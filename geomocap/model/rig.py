@@ -14,6 +14,8 @@ import pycolmap
 
 from geomocap.errors import CalibrationError
 
+LEAST_FOCAL = 1e-3  # of an image's width: it would see 179.9° across
+
 
 @dataclass(frozen=True)
 class Rig:
@@ -158,9 +160,13 @@ class Rig:
         the pixels come from.
         """
         cameras = []
-        for camera in self.cameras:
+        for name, camera in zip(self.names, self.cameras, strict=True):
             w, h = camera.width, camera.height
             fx, fy = camera.focal_length_x, camera.focal_length_y
+            if min(abs(fx), abs(fy)) < LEAST_FOCAL * w:
+                raise CalibrationError(
+                    f"camera {name}: focal length {fx:g}, {fy:g} pixels can't be; calibrate it again"
+                )
             if camera.is_undistorted():
                 K = camera.calibration_matrix()
                 params = [fx, fy, K[0, 2], K[1, 2]]
