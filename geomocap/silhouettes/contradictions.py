@@ -264,7 +264,7 @@ def _worst(
         return Contradiction(wrong, best.what, mean(best.before), mean(best.after)), best.evidence, rest
     for k in at_fault[:1]:
         own, theirs = mean(before[:, k]), mean((before - without[k])[:, others[k]])
-        still = own > STILL and evidence.still(k) > STILL
+        still = theirs < STILL < min(own, evidence.still(k))
         if max(own, theirs) > 0.5 or min(own, theirs) > DISPLACED or still:
             what = f"the others deny {own:.0%} of what it sees, and it denies {theirs:.0%} of what they see"
             if still:
