@@ -4,7 +4,7 @@ capture.toml                     name, fps, length_unit, up; optional: cameras, 
                                  region_of_interest
 images/<camera>/000000.png       or videos/<camera>.mp4
 background/<camera>.png          optional
-masks/<camera>/000000.png        optional, used as they are
+masks/<camera>/000000.png        optional, used as they are; with masks there may be no images at all
 sparse/                          calibration, a COLMAP model
 bar/<camera>/000000.png          optional reference-bar recording
 """
@@ -129,7 +129,7 @@ class Capture:
         info = read_capture_info(path)
         found = _find_sources(path)
         if not found:
-            raise CaptureError(f"{path}: holds neither images/<camera>/*.png nor videos/<camera>.mp4")
+            raise CaptureError(f"{path}: holds neither images/<camera>/*.png nor videos/<camera>.mp4 nor masks")
         names = info.cameras or tuple(sorted(found))
         for name in names:
             if name not in found:
@@ -202,6 +202,11 @@ class Capture:
     def _background_file(self, camera: str) -> Path | None:
         files = [self.path / "background" / f"{camera}{e}" for e in IMAGE_ENDINGS]
         return next((f for f in files if f.is_file()), None)
+
+    @property
+    def has_images(self) -> bool:
+        """Whether there are images; otherwise the frames are those of the given silhouettes."""
+        return any((self.path / part).is_dir() for part in ("images", "videos"))
 
     @property
     def has_masks(self) -> bool:
@@ -324,8 +329,17 @@ def write_capture_info(path: Path, info: CaptureInfo) -> None:
 
 
 def _find_sources(path: Path) -> dict[str, FrameSource]:
+    """Frames by camera: images, videos, or if there are neither, the given silhouettes."""
+    sources = _image_folders(path / "images")
+    for file in sorted((path / "videos").glob("*")):
+        if file.suffix.lower() in VIDEO_ENDINGS and file.stem not in sources:
+            sources[file.stem] = Video(file)
+    return sources or _image_folders(path / "masks")
+
+
+def _image_folders(parent: Path) -> dict[str, FrameSource]:
     sources: dict[str, FrameSource] = {}
-    for folder in sorted(p for p in (path / "images").glob("*") if p.is_dir()):
+    for folder in sorted(p for p in parent.glob("*") if p.is_dir()):
         files = tuple(sorted(f for f in folder.iterdir() if f.suffix.lower() in IMAGE_ENDINGS))
         for k, file in enumerate(files):
             if file.stem != f"{k:06d}":
@@ -333,7 +347,4 @@ def _find_sources(path: Path) -> dict[str, FrameSource]:
         if not files:
             raise CaptureError(f"{folder}: holds no frames (000000.png …)")
         sources[folder.name] = ImageFolder(files)
-    for file in sorted((path / "videos").glob("*")):
-        if file.suffix.lower() in VIDEO_ENDINGS and file.stem not in sources:
-            sources[file.stem] = Video(file)
     return sources
