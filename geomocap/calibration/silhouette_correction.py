@@ -16,12 +16,11 @@ Sinha, Pollefeys, McMillan, Camera network calibration from dynamic silhouettes,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geomocap.calibration.silhouette_tangents import OutlineRays, camera_pairs, tangent_misfits
+from geomocap.model.camera_correction import CameraCorrection
 from geomocap.model.rig import Rig
 
 POSE = 6  # numbers of a pose
@@ -30,30 +29,6 @@ ROUNDS = 30
 CONVERGED = 1e-3  # of the standard deviation of the poses given
 CAUCHY = 2.385  # standard deviations at which an observation counts half (95 % efficient where noise is normal)
 STEP = 1e-4  # of the same, for differences
-
-
-@dataclass(frozen=True)
-class CameraCorrection:
-    """What the silhouettes say of a calibration.
-
-    Attributes
-    ----------
-    given, rig : Rig
-        The calibration, and the cameras to use: the same if no correction is called for.
-    before, after : float, pixels
-        Median disagreement of the cameras about the outlines, and what is left of it in frames that a correction
-        wasn't found from. NaN if the outlines can't tell.
-    """
-
-    given: Rig
-    rig: Rig
-    before: float
-    after: float
-
-    @property
-    def is_corrected(self) -> bool:
-        """Whether the cameras to use are others than those given."""
-        return self.rig is not self.given
 
 
 def correct_cameras(given: Rig, outlines: OutlineRays, resolution: float = 1.0) -> CameraCorrection:
@@ -69,15 +44,22 @@ def correct_cameras(given: Rig, outlines: OutlineRays, resolution: float = 1.0) 
     """
     halves = outlines.some(slice(0, None, 2)), outlines.some(slice(1, None, 2))
     start = np.zeros(POSE * len(given))
-    first = [_known(_misfits(given, half, start)) for half in halves]
-    if min(len(r) for r in first) < 2 * POSE * len(given):
+    first = [_misfits(given, half, start) for half in halves]
+    if min(len(_known(misfits)) for misfits in first) < 2 * POSE * len(given):
         return CameraCorrection(given, given, np.nan, np.nan)
-    before = float(np.median(np.abs(np.concatenate(first))))
+    before = _of_worst_camera(len(given), np.concatenate(first, axis=1))
     fitted = [_adjust(given, half) for half in halves]
-    left = [_known(_misfits(given, half, pose)) for half, pose in zip(halves, fitted[::-1], strict=True)]
-    after = float(np.median(np.abs(np.concatenate(left))))
+    left = [_misfits(given, half, pose) for half, pose in zip(halves, fitted[::-1], strict=True)]
+    after = _of_worst_camera(len(given), np.concatenate(left, axis=1))
     called_for = before > resolution and after**2 < 0.5 * before**2
     return CameraCorrection(given, _moved(given, _adjust(given, outlines)) if called_for else given, before, after)
+
+
+def _of_worst_camera(count: int, misfits: np.ndarray) -> float:
+    """Median misfit of the camera that disagrees most with the others, pixels."""
+    pairs = np.array(camera_pairs(count))
+    each = [_known(misfits[(pairs == c).any(axis=1)]) for c in range(count)]
+    return max(float(np.median(np.abs(r))) for r in each if len(r))
 
 
 def _known(misfits: np.ndarray) -> np.ndarray:
@@ -91,9 +73,8 @@ def _misfits(given: Rig, outlines: OutlineRays, pose: np.ndarray) -> np.ndarray:
 def _poses(given: Rig, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotations and centres after changes (6 C,): rotation vectors in the cameras' axes, and metres in the world's."""
     change = pose.reshape(-1, POSE)
-    return Rotation.from_rotvec(change[:, :3]).as_matrix() @ given.cam_from_world[:, :, :3], given.centers + change[
-        :, 3:
-    ]
+    rotations = Rotation.from_rotvec(change[:, :3]).as_matrix() @ given.cam_from_world[:, :, :3]
+    return rotations, given.centers + change[:, 3:]
 
 
 def _moved(given: Rig, pose: np.ndarray) -> Rig:
@@ -117,7 +98,7 @@ def _adjust(given: Rig, outlines: OutlineRays) -> np.ndarray:
             moved = pose + np.eye(len(pose))[k] * STEP * scale
             there = tangent_misfits(outlines, *_poses(given, moved), [pairs[i] for i in rows])
             slopes[rows, :, :, k] = np.where(np.isfinite(there), there - residual[rows], 0.0) / STEP
-        noise = _noise(misfits)
+        noise = _noise(misfits)[:, None, None]
         weight = np.where(known, 1.0 / (1.0 + (residual / (CAUCHY * noise)) ** 2), 0.0) / noise**2
         J, r, w = slopes[known], residual[known], weight[known]
         normal = (J * w[:, None]).T @ J + np.eye(len(pose))  # the poses given are observations too
@@ -128,13 +109,17 @@ def _adjust(given: Rig, outlines: OutlineRays) -> np.ndarray:
     return pose
 
 
-def _noise(misfits: np.ndarray) -> float:
-    """Robust standard deviation of the misfits, pixels."""
-    return max(1.4826 * float(np.median(np.abs(_known(misfits)))), LEAST_NOISE)
+def _noise(misfits: np.ndarray) -> np.ndarray:
+    """Robust standard deviation of the misfits of each pair, (P,) pixels: the larger, the worse the pair agrees yet."""
+    each = [np.abs(_known(pair)) for pair in misfits]
+    return np.array([max(1.4826 * float(np.median(r)), LEAST_NOISE) if len(r) else 1.0 for r in each])
 
 
-def _uncertainty(given: Rig, outlines: OutlineRays, pixels: float) -> np.ndarray:
-    """Standard deviations (6 C,) of poses that put the subject so many pixels wrong, rad and metres."""
+def _uncertainty(given: Rig, outlines: OutlineRays, noise: np.ndarray) -> np.ndarray:
+    """Standard deviations (6 C,) of the poses given, rad and metres: they shift the subject by as many pixels as a
+    camera disagrees with the others, half of these more and half less."""
+    pairs = np.array(camera_pairs(len(given)))
+    pixels = np.array([np.median(noise[(pairs == c).any(axis=1)]) for c in range(len(given))])
     axes = np.einsum("cfki,cij->cfj", outlines.rays, given.cam_from_world[:, :, :3])
     axes = (axes * outlines.seen[..., None]).sum(axis=1)
     axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-12)

@@ -8,6 +8,7 @@ from pathlib import Path
 from geomocap.cli.console import console
 from geomocap.errors import GeomocapError
 from geomocap.files.atomic import fingerprint
+from geomocap.files.camera_files import as_seen
 from geomocap.files.capture import Capture
 from geomocap.files.results import read_cloud_record
 from geomocap.files.run import Run, stage_key
@@ -32,6 +33,7 @@ def review_job(job: Job, made_from: str) -> None:
 
 def review_run(run: Run, capture: Capture | None, progress: Progress = silent) -> list[Path]:
     """Make pictures and report of a run, with a frame's surface measured again where it was measured."""
+    capture = None if capture is None else as_seen(run, capture)
     return review(run, capture, measured=partial(measure_again, run, capture), progress=progress)
 
 
@@ -41,7 +43,7 @@ def capture_of(run: Run) -> Capture | None:
     if source.get("kind") != "capture":
         return None
     try:
-        return Capture.open(Path(source["path"]))
+        return as_seen(run, Capture.open(Path(source["path"])))
     except GeomocapError as error:
         console.print(f"note: the capture can't be shown ({error})")
         return None

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, Protocol
@@ -105,12 +105,15 @@ class Capture:
         Camera names in the order used everywhere.
     sources : dict of str to FrameSource
         All that was recorded, also what isn't used.
+    corrected : Rig, optional
+        Cameras to use instead of the calibration.
     """
 
     path: Path
     info: CaptureInfo
     cameras: tuple[str, ...]
     sources: dict[str, FrameSource]
+    corrected: Rig | None = None
 
     @classmethod
     def open(cls, path: Path) -> Capture:
@@ -263,6 +266,8 @@ class Capture:
         CaptureError
             If an image's size is not the one that the camera is calibrated for.
         """
+        if self.corrected is not None:
+            return self.corrected
         if not self.is_calibrated:
             raise CaptureError(f"{self.path}: not calibrated, no folder sparse/; run `geomocap calibrate {self.path}`")
         rig = read_rig(self.path / "sparse", self.cameras)
@@ -275,6 +280,10 @@ class Capture:
                     "calibrate again, or import with the tool that made the calibration"
                 )
         return rig
+
+    def with_rig(self, rig: Rig) -> Capture:
+        """Return the capture with other cameras than those it is calibrated with."""
+        return replace(self, corrected=rig)
 
     def fingerprint(self, *parts: str) -> str:
         """Digest of the names, sizes and times of the files of these parts ("images", "masks", "sparse" …)."""

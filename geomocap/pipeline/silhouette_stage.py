@@ -14,6 +14,7 @@ from geomocap.errors import CaptureError
 from geomocap.files.atomic import write_atomic
 from geomocap.files.capture import Capture
 from geomocap.files.run import Run, stage_key
+from geomocap.pipeline.camera_stage import with_cameras
 from geomocap.pipeline.job import Job
 from geomocap.scheduling import map_items
 from geomocap.silhouettes.background import BackgroundModel, model_from_frames, model_from_plate
@@ -25,6 +26,7 @@ from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 def silhouettes(job: Job) -> str:
     """Make the silhouettes of all cameras and frames, and return the stage's key."""
+    job, cameras = with_cameras(job)
     capture = job.capture
     if capture is None:
         raise CaptureError("silhouettes need a capture")
@@ -34,6 +36,7 @@ def silhouettes(job: Job) -> str:
         str(capture.path.resolve()),
         capture.fingerprint("images", "videos", "background", "masks", "sparse"),
         job.config.silhouettes.model_dump(),
+        cameras,
     )
     job.write_record("silhouettes")
     return job.stage("silhouettes", key, ["silhouettes"], lambda: _make_silhouettes(job, capture))
