@@ -27,6 +27,7 @@ POSE = 6  # numbers of a pose
 LEAST_NOISE = 12**-0.5  # standard deviation of an outline that is only rounded to pixels
 ROUNDS = 30
 CONVERGED = 1e-3  # of the standard deviation of the poses given
+SOONER = 0.7  # by which outliers are told the more strictly in each round
 CAUCHY = 2.385  # standard deviations at which an observation counts half (95 % efficient where noise is normal)
 STEP = 1e-4  # of the same, for differences
 
@@ -87,7 +88,9 @@ def _adjust(given: Rig, outlines: OutlineRays) -> np.ndarray:
     """Change of the poses (6 C,) that makes the tangents agree: iteratively reweighted least squares, Cauchy's loss."""
     pairs = camera_pairs(len(given))
     pose = np.zeros(POSE * len(given))
-    scale = _uncertainty(given, outlines, _noise(_misfits(given, outlines, pose)))
+    noise = _noise(_misfits(given, outlines, pose))
+    scale = _uncertainty(given, outlines, noise)
+    reach = float(noise.max())  # first all is heeded, then what fits
     for _ in range(ROUNDS):
         misfits = _misfits(given, outlines, pose)
         known = np.isfinite(misfits)
@@ -98,19 +101,19 @@ def _adjust(given: Rig, outlines: OutlineRays) -> np.ndarray:
             moved = pose + np.eye(len(pose))[k] * STEP * scale
             there = tangent_misfits(outlines, *_poses(given, moved), [pairs[i] for i in rows])
             slopes[rows, :, :, k] = np.where(np.isfinite(there), there - residual[rows], 0.0) / STEP
-        noise = _noise(misfits)[:, None, None]
-        weight = np.where(known, 1.0 / (1.0 + (residual / (CAUCHY * noise)) ** 2), 0.0) / noise**2
+        reach = max(SOONER * reach, _noise(misfits[None])[0])
+        weight = np.where(known, 1.0 / (1.0 + (residual / (CAUCHY * reach)) ** 2), 0.0) / reach**2
         J, r, w = slopes[known], residual[known], weight[known]
         normal = (J * w[:, None]).T @ J + np.eye(len(pose))  # the poses given are observations too
         step = np.linalg.solve(normal, -(J * w[:, None]).T @ r - pose / scale)
         pose = pose + step * scale
-        if np.abs(step).max() < CONVERGED:
+        if np.abs(step).max() < CONVERGED and reach <= noise.max() * SOONER:
             break
     return pose
 
 
 def _noise(misfits: np.ndarray) -> np.ndarray:
-    """Robust standard deviation of the misfits of each pair, (P,) pixels: the larger, the worse the pair agrees yet."""
+    """Robust standard deviation of the misfits of each pair, (P,) pixels."""
     each = [np.abs(_known(pair)) for pair in misfits]
     return np.array([max(1.4826 * float(np.median(r)), LEAST_NOISE) if len(r) else 1.0 for r in each])
 
