@@ -7,7 +7,9 @@ as observations with the uncertainty that the disagreement itself shows, so that
 direction and scale of the world, and what the subject's motion doesn't show) stays as it was.
 
 A correction has to prove itself on frames that it wasn't found from: each half of the frames is predicted by the
-other half. It is made only if the calibration explains the greater part of the disagreement.
+other half. It is made only if the calibration explains the greater part of the disagreement, and if with it every pair
+of cameras agrees to within the pixels of the outlines: what is left otherwise is silhouettes that are wrong, and these
+must not move a camera.
 
 References
 ----------
@@ -48,18 +50,17 @@ def correct_cameras(given: Rig, outlines: OutlineRays, resolution: float = 1.0) 
     first = [_misfits(given, half, start) for half in halves]
     if min(len(_known(misfits)) for misfits in first) < 2 * POSE * len(given):
         return CameraCorrection(given, given, np.nan, np.nan)
-    before = _of_worst_camera(len(given), np.concatenate(first, axis=1))
+    before = _of_worst_pair(np.concatenate(first, axis=1))
     fitted = [_adjust(given, half) for half in halves]
     left = [_misfits(given, half, pose) for half, pose in zip(halves, fitted[::-1], strict=True)]
-    after = _of_worst_camera(len(given), np.concatenate(left, axis=1))
-    called_for = before > resolution and after**2 < 0.5 * before**2
+    after = _of_worst_pair(np.concatenate(left, axis=1))
+    called_for = after <= resolution and before > resolution and after**2 < 0.5 * before**2
     return CameraCorrection(given, _moved(given, _adjust(given, outlines)) if called_for else given, before, after)
 
 
-def _of_worst_camera(count: int, misfits: np.ndarray) -> float:
-    """Median misfit of the camera that disagrees most with the others, pixels."""
-    pairs = np.array(camera_pairs(count))
-    each = [_known(misfits[(pairs == c).any(axis=1)]) for c in range(count)]
+def _of_worst_pair(misfits: np.ndarray) -> float:
+    """Median misfit of the pair of cameras that disagrees most, pixels."""
+    each = [_known(pair) for pair in misfits]
     return max(float(np.median(np.abs(r))) for r in each if len(r))
 
 

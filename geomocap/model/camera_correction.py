@@ -16,8 +16,8 @@ class CameraCorrection:
     given, rig : Rig
         The calibration, and the cameras to use: the same if no correction is called for.
     before, after : float, pixels
-        Median disagreement about the outlines of the camera that disagrees most with the others, and what is left of
-        it in frames that a correction wasn't found from. NaN if the outlines can't tell.
+        Median disagreement about the outlines of the two cameras that disagree most, and what is left of it in frames
+        that a correction wasn't found from. NaN if the outlines can't tell.
     """
 
     given: Rig
