@@ -125,6 +125,25 @@ def test_silhouettes_that_are_wrong_don_t_move_right_cameras(rig, masks):
     assert not found.is_corrected
 
 
+@pytest.mark.parametrize("wrong", ["legs", "half", "noise"])
+def test_a_camera_whose_silhouettes_are_always_wrong_moves_no_camera(rig, masks, wrong):
+    spoilt = [[m.copy() for m in frame] for frame in masks]
+    rng = np.random.default_rng(0)
+    for frame in spoilt:
+        rows = np.flatnonzero(frame[1].any(axis=1))
+        columns = np.flatnonzero(frame[1].any(axis=0))
+        if wrong == "legs":
+            frame[1][(rows[0] + rows[-1]) // 2 :] = 0
+        elif wrong == "half":
+            frame[1][:, int(columns.mean()) :] = 0
+        else:
+            x, y = rng.integers(20, 200, 2)
+            frame[1][:] = 0
+            frame[1][y : y + 30, x : x + 60] = 255
+    found = correct_cameras(rig, OutlineRays.of(rig, spoilt))
+    assert not found.is_corrected and found.before > 1.0
+
+
 def test_too_little_is_no_evidence(rig, masks):
     wrong = turned(rig, 2, 2.0)
     assert not correct_cameras(wrong, OutlineRays.of(wrong, masks[:2])).is_corrected
