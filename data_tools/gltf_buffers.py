@@ -7,13 +7,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import unquote
 
-import cv2
 import numpy as np
 import pygltflib
 
 from data_tools.asset import AssetError
+from geomocap.errors import CaptureError
+from geomocap.files.images import decode_image
+from geomocap.reading import read_bytes
 
 COMPONENT_TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+MOST_ELEMENTS = 1 << 26  # of an accessor; vertices of the largest meshes are a tenth of that
 COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
 
@@ -39,6 +42,8 @@ class GltfBuffers:
         """
         accessor = self.gltf.accessors[index]
         kind, width = np.dtype(COMPONENT_TYPES[accessor.componentType]), COMPONENTS[accessor.type]
+        if not 0 <= accessor.count <= MOST_ELEMENTS:
+            raise AssetError(f"{self.path}: an accessor claims {accessor.count:,} elements; the file is damaged")
         if accessor.bufferView is None:
             values = np.zeros((accessor.count, width), dtype=kind)
         else:
@@ -64,10 +69,10 @@ class GltfBuffers:
             data = self._buffer(view.buffer)[start : start + view.byteLength]
         else:
             data = self._uri(image.uri)
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB) if data else None
-        if pixels is None:
-            raise AssetError(f"{self.path}: image {index} ({image.name or image.uri or 'embedded'}) can't be decoded")
-        return pixels
+        try:
+            return decode_image(data, f"{self.path}: image {index} ({image.name or image.uri or 'embedded'})")
+        except CaptureError as error:
+            raise AssetError(str(error)) from None
 
     def _elements(self, view_index: int, offset: int, count: int, kind: np.dtype, width: int) -> np.ndarray:
         view = self.gltf.bufferViews[view_index]
@@ -93,6 +98,6 @@ class GltfBuffers:
         if not file.is_relative_to(folder):
             raise AssetError(f"{self.path}: refers to {uri}, outside its own folder; copy that file beside it")
         try:
-            return file.read_bytes()
+            return read_bytes(file)
         except OSError as error:
             raise AssetError(f"{file}: can't be read ({error.strerror}); {self.path.name} needs it") from None

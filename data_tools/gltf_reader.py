@@ -15,7 +15,9 @@ import pygltflib
 from data_tools.animation import Channel, NodeTree, transform
 from data_tools.asset import WORLD_FROM_GLTF, AnimatedAsset, AssetError
 from data_tools.gltf_buffers import GltfBuffers
+from geomocap.reading import read_bytes, reason
 
+_INVALID = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, MemoryError, RecursionError)
 READABLE_EXTENSIONS = ("KHR_mesh_quantization", "KHR_texture_transform", "KHR_materials_", "KHR_lights_", "KHR_xmp")
 
 
@@ -41,8 +43,8 @@ def load_gltf(path: Path, animation: str | int | None = None) -> AnimatedAsset:
     try:
         channels = _channels(GltfBuffers(path, gltf), _choose(path, gltf, animation))
         return _Reader(path, gltf, GltfBuffers(path, gltf), channels).asset()
-    except (IndexError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise AssetError(f"{path}: not a valid glTF file ({error}); export it again") from None
+    except _INVALID as error:
+        raise AssetError(f"{path}: not a valid glTF file ({reason(error)}); export it again") from None
 
 
 def _open(path: Path) -> pygltflib.GLTF2:
@@ -51,10 +53,10 @@ def _open(path: Path) -> pygltflib.GLTF2:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            binary = path.read_bytes()[:4] == b"glTF"
+            binary = read_bytes(path)[:4] == b"glTF"
             gltf = pygltflib.GLTF2.load_binary(str(path)) if binary else pygltflib.GLTF2.load_json(str(path))
     except Exception as error:
-        raise AssetError(f"{path}: not a readable glTF file ({error}); export it again as .glb") from None
+        raise AssetError(f"{path}: not a readable glTF file ({reason(error)}); export it again as .glb") from None
     if gltf is None:
         raise AssetError(f"{path}: not a readable glTF file; export it again as .glb")
     unknown = [e for e in gltf.extensionsRequired or [] if not e.startswith(READABLE_EXTENSIONS)]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -16,13 +14,15 @@ from data_tools.image_sizes import SizeMismatch, find_fit, refit_camera
 from data_tools.plates import compose_plate
 from data_tools.synthesize import write_png
 from geomocap.errors import CalibrationError, CaptureError, GeomocapError
-from geomocap.files.atomic import write_atomic
+from geomocap.files.atomic import copy_whole
 from geomocap.files.capture import Capture, CaptureInfo, write_capture_info
-from geomocap.files.images import IMAGE_ENDINGS, read_image
+from geomocap.files.images import IMAGE_ENDINGS, check_image, read_image
 from geomocap.files.rigs import read_rig, write_rig
 from geomocap.files.videos import VIDEO_ENDINGS, Video
 from geomocap.model.rig import Rig
 from geomocap.progress import Progress, silent
+from geomocap.reading import list_folder, read_toml
+from geomocap.settings import LEAST_FPS, MOST_FPS
 
 PLATE_FRAMES = 25  # frames of a video that a plate is composed from
 
@@ -105,9 +105,10 @@ def import_pose2sim(
             )
         cameras.append(camera)
         target = capture / "videos" / f"{name}{file.suffix.lower()}"
-        write_atomic(target, lambda p, file=file: shutil.copyfile(file, p))  # type: ignore[misc]
+        copy_whole(file, target)
     progress("videos", len(files), len(files))
-    rig = Rig(rig.names, tuple(cameras), np.array(rig.cam_from_world))
+    rig = Rig(rig.names, tuple(cameras), np.array(rig.cam_from_world), rig.notes)
+    notes += rig.notes
     write_rig(capture / "sparse", rig)
     fps = _frame_rate(source, files)
     write_capture_info(capture, CaptureInfo(name=source.resolve().name, fps=fps, up="z", cameras=rig.names))
@@ -156,17 +157,18 @@ def import_colmap(
     rig = read_rig(model)
     pose = np.array(rig.cam_from_world)
     pose[:, :, 3] *= metres_per_unit
-    rig = Rig(rig.names, rig.cameras, pose)
-    for k, name in enumerate(rig.names):
+    rig = Rig.of_file(str(model), rig.names, rig.cameras, pose, rig.notes)
+    frames = {name: _checked_images(source / "images" / name) for name in rig.names}
+    counts = {name: len(files) for name, files in frames.items()}
+    if len(set(counts.values())) > 1:
+        listed = ", ".join(f"{n}: {c}" for n, c in counts.items())
+        raise CaptureError(f"{source}: cameras have unequal numbers of frames ({listed}); cut them to the same frames")
+    for k, (name, files) in enumerate(frames.items()):
         progress("images", k, len(rig))
-        folder = source / "images" / name
-        files = sorted(f for f in folder.glob("*") if f.is_file() and not f.name.startswith("."))
-        if not files:
-            raise CaptureError(f"{folder}: holds no images; COLMAP's images must lie in images/<camera>/<frame>.*")
         for t, file in enumerate(files):
             target = capture / "images" / name / f"{t:06d}{file.suffix.lower()}"
             if file.suffix.lower() in IMAGE_ENDINGS:
-                write_atomic(target, lambda p, file=file: shutil.copyfile(file, p))  # type: ignore[misc]
+                copy_whole(file, target)
             else:  # other formats are stored anew, without loss
                 write_png(target.with_suffix(".png"), read_image(file))
     progress("images", len(rig), len(rig))
@@ -174,7 +176,18 @@ def import_colmap(
     write_capture_info(capture, CaptureInfo(name=source.resolve().name, fps=fps, up=up, cameras=rig.names))
     opened = Capture.open(capture)
     notes = () if metres_per_unit != 1.0 else ("the model's unit is taken as a metre; give metres_per_unit if not",)
-    return ImportReport(opened, opened.rig, notes)
+    return ImportReport(opened, opened.rig, (*rig.notes, *notes))
+
+
+def _checked_images(folder: Path) -> list[Path]:
+    """List the images of a camera, all of which are whole."""
+    entries = list_folder(folder, CaptureError) if folder.is_dir() else []
+    files = [f for f in entries if f.is_file() and not f.name.startswith(".")]
+    if not files:
+        raise CaptureError(f"{folder}: holds no images; COLMAP's images must lie in images/<camera>/<frame>.*")
+    for file in files:
+        check_image(file)
+    return files
 
 
 def _must_be_free(capture: Path) -> None:
@@ -229,11 +242,15 @@ def _frame_rate(source: Path, files: list[Path]) -> float:
     """Frames per second: as Config.toml says, else as all videos agree."""
     config = source / "Config.toml"
     if config.is_file():
-        try:
-            rate = tomllib.loads(config.read_text(encoding="utf-8")).get("project", {}).get("frame_rate")
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise CaptureError(f"{config}: not valid TOML ({error})") from None
-        if isinstance(rate, int | float) and rate > 0:
+        project = read_toml(config, CaptureError).get("project", {})
+        if not isinstance(project, dict):
+            raise CaptureError(f"{config}: project is no table; write [project] as Pose2Sim does")
+        rate = project.get("frame_rate")
+        if isinstance(rate, int | float) and not isinstance(rate, bool):
+            if not LEAST_FPS <= rate <= MOST_FPS:
+                raise CaptureError(
+                    f"{config}: frame_rate is {rate}; expected {LEAST_FPS:g} to {MOST_FPS:,.0f} per second"
+                )
             return float(rate)
     rates = {file.name: frame_rate(file) for file in files}
     if max(rates.values()) - min(rates.values()) > 0.01 * max(rates.values()):

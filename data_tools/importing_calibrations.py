@@ -6,8 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
-import cv2
-
 from data_tools.calibration_files import (
     detect_format,
     read_calibration,
@@ -20,7 +18,7 @@ from data_tools.calibration_files import (
 )
 from geomocap.errors import CalibrationError
 from geomocap.files.capture import CaptureInfo, write_capture_info
-from geomocap.files.images import IMAGE_ENDINGS
+from geomocap.files.images import IMAGE_ENDINGS, image_size
 from geomocap.files.rigs import write_rig
 from geomocap.files.videos import VIDEO_ENDINGS, Video
 from geomocap.model.rig import Rig
@@ -75,7 +73,7 @@ def import_calibration(
         raise CalibrationError(f"{capture}: has a calibration already; delete {capture / 'sparse'} to replace it")
     sizes = _image_sizes(capture)
     rig = read_calibration(source, metres_per_unit, sizes or None)
-    notes = [f"read as {detect_format(source)}: {', '.join(rig.names)}"]
+    notes = [f"read as {detect_format(source)}: {', '.join(rig.names)}", *rig.notes]
     for name, camera in zip(rig.names, rig.cameras, strict=True):
         if name in sizes and sizes[name] != (camera.width, camera.height):
             w, h = sizes[name]
@@ -109,9 +107,8 @@ def _image_sizes(capture: Path) -> dict[str, tuple[int, int]]:
     sizes = {}
     for folder in sorted((capture / "images").glob("*")):
         first = next((f for f in sorted(folder.glob("*")) if f.suffix.lower() in IMAGE_ENDINGS), None)
-        image = None if first is None else cv2.imread(str(first))
-        if image is not None:
-            sizes[folder.name] = (image.shape[1], image.shape[0])
+        if first is not None:
+            sizes[folder.name] = image_size(first)
     for file in sorted((capture / "videos").glob("*")):
         if file.suffix.lower() in VIDEO_ENDINGS and file.stem not in sizes:
             height, width = Video(file).read(0).shape[:2]

@@ -7,7 +7,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from pydantic import Field
 
@@ -22,21 +21,22 @@ from data_tools.video_writing import VideoFile
 from geomocap.errors import CaptureError
 from geomocap.files.atomic import write_atomic
 from geomocap.files.capture import CaptureInfo, write_capture_info
+from geomocap.files.images import MOST_SIDE, write_image
 from geomocap.files.rigs import write_rig
 from geomocap.model.rig import Rig
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads
-from geomocap.settings import Settings
+from geomocap.settings import LEAST_FPS, MOST_FPS, Settings
 
 
 class SynthesisSettings(Settings):
     """How a synthetic capture is made."""
 
-    cameras: int = Field(8, ge=1, description="number of cameras")
-    width: int = Field(640, ge=16, description="image width (pixels)")
-    height: int = Field(480, ge=16, description="image height (pixels)")
-    fps: float = Field(30.0, gt=0, description="frames per second")
-    frames: int = Field(60, ge=1, description="number of frames")
+    cameras: int = Field(8, ge=1, le=1000, description="number of cameras")
+    width: int = Field(640, ge=16, le=MOST_SIDE, description="image width (pixels)")
+    height: int = Field(480, ge=16, le=MOST_SIDE, description="image height (pixels)")
+    fps: float = Field(30.0, ge=LEAST_FPS, le=MOST_FPS, description="frames per second")
+    frames: int = Field(60, ge=1, le=999_999, description="number of frames")
     start: float = Field(0.0, ge=0, description="time in the clip at which the capture begins (s)")
     subject_height: float | None = Field(
         None, gt=0, description="height of the subject at the clip's begin (m); the file's own if not given"
@@ -300,6 +300,4 @@ def write_truth(
 
 def write_png(path: Path, image: np.ndarray) -> None:
     """Write an image (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) grey, uint8, with OpenCV's fast default compression."""
-    if image.ndim == 3:
-        image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
-    write_atomic(path, lambda p: cv2.imwrite(str(p), image))
+    write_image(path, image)

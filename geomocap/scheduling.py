@@ -18,6 +18,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+MOST_WORKERS = max(256, 4 * (os.cpu_count() or 1))  # threads; each takes memory, and none beyond the cores helps
 _limit: int | None = None
 
 
@@ -45,7 +46,7 @@ def threads(workers: int | None = None) -> Iterator[ThreadPoolExecutor]:
     workers : int, optional
         Number of threads; if not given the limit that was set, else the number of cores.
     """
-    count = workers or _limit or os.cpu_count() or 1
+    count = min(workers or _limit or os.cpu_count() or 1, MOST_WORKERS)
     kernel_threads = max(1, numba.get_num_threads() // count)
     with ThreadPoolExecutor(count, initializer=numba.set_num_threads, initargs=(kernel_threads,)) as executor:
         yield executor

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -12,8 +11,11 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 from geomocap.errors import SettingsError
+from geomocap.reading import read_toml, shortened
 
 Model = TypeVar("Model", bound="Settings")
+MOST_COUNTED, MOST_MEASURED = 10_000_000, 1e9  # of any setting: things counted, and metres, pixels, degrees
+LEAST_FPS, MOST_FPS = 0.001, 1e6  # from one picture in a quarter of an hour to the fastest cameras
 
 
 class Settings(BaseModel):
@@ -32,8 +34,28 @@ class Settings(BaseModel):
         """Refuse true and false for numbers, also within lists; Python would take them as 1 and 0."""
         types = _types(cls.model_fields[str(info.field_name)].annotation)
         if types & {int, float} and bool not in types and _holds_truth(value):
-            raise PydanticCustomError("truth_for_number", "Input should be a number, not true or false")
+            raise PydanticCustomError("truth_for_number", "must be a number, not true or false")
         return value
+
+    @field_validator("*")
+    @classmethod
+    def _within_reason(cls, value: Any) -> Any:
+        """Refuse numbers that nothing in a recording has: they would only take all memory, or all time."""
+        for number in _numbers(value):
+            most = MOST_COUNTED if isinstance(number, int) else MOST_MEASURED
+            if abs(number) > most:
+                raise PydanticCustomError(
+                    "beyond_reason", "must lie between {least} and {most}", {"least": -most, "most": most}
+                )
+        return value
+
+
+def _numbers(value: Any) -> Iterator[int | float]:
+    if isinstance(value, list | tuple):
+        for item in value:
+            yield from _numbers(item)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield value
 
 
 def _types(annotation: Any) -> set[Any]:
@@ -83,13 +105,25 @@ def check_settings(model: type[Model], values: dict[str, Any], where: str = "") 
         return model(**values)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(p) for p in first["loc"]) or "(all)"
+        key = shortened(".".join(str(p) for p in first["loc"]))
         start = f"{where}: " if where else ""
         if first["type"] == "extra_forbidden":
             raise SettingsError(f"{start}unknown setting {key}; docs/settings.md lists them all") from None
-        if not first["loc"]:
-            raise SettingsError(f"{start}{first['msg'].removeprefix('Value error, ')}") from None
-        raise SettingsError(f"{start}setting {key} = {first['input']!r}: {first['msg']}") from None
+        given = f"setting {key} = {shortened(repr(first['input']))}: " if key else ""
+        raise SettingsError(f"{start}{given}{_plain(first['msg'])}") from None
+
+
+def explained(error: ValidationError) -> str:
+    """Say of the first wrong value of a file which key it is and what was expected."""
+    first = error.errors()[0]
+    key = shortened(".".join(str(p) for p in first["loc"]))
+    return f"{key}: {_plain(first['msg'])}" if key else _plain(first["msg"])
+
+
+def _plain(message: str) -> str:
+    """Word a message of pydantic as ours are."""
+    message = message.removeprefix("Value error, ").replace("Input should be", "must be")
+    return {"Field required": "is missing", "Extra inputs are not permitted": "no such key"}.get(message, message)
 
 
 def load_settings(model: type[Model], path: Path | None = None, overrides: dict[str, Any] | None = None) -> Model:
@@ -109,19 +143,14 @@ def load_settings(model: type[Model], path: Path | None = None, overrides: dict[
         If the file can't be read, a key is unknown or a value out of range.
     """
     values = {} if path is None else read_settings(path)
-    if "config" in values and "geomocap" in values:  # a run.toml
+    if {"config", "geomocap"} <= values.keys() and isinstance(values["config"], dict):  # a run.toml
         values = values["config"]
     return check_settings(model, _merge(values, overrides or {}), str(path) if path is not None else "")
 
 
 def read_settings(path: Path) -> dict[str, Any]:
     """Read a settings file as it is; raises SettingsError if it isn't TOML or can't be read."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SettingsError(f"{path}: can't be read ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path}: not valid TOML ({error})") from None
+    return read_toml(path, SettingsError)
 
 
 def _merge(values: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:

@@ -8,13 +8,14 @@ from collections import Counter
 
 from tests.arrows import PACKAGES, ROOT, arrows, circle, sources
 
-BASE = {"errors", "progress", "settings", "scheduling"}
+BASE = {"errors", "progress", "reading", "settings", "scheduling"}
 VALUES = BASE | {"model"}
 ROOMS: dict[str, set[str]] = {
     # without anything of the subject
     "errors": set(),
     "progress": set(),
-    "settings": {"errors"},
+    "reading": {"errors"},
+    "settings": {"errors", "reading"},
     "scheduling": {"progress"},
     "version": set(),
     "source_digest": set(),
@@ -43,7 +44,7 @@ ROOMS: dict[str, set[str]] = {
     # out of the house
     "export": VALUES | {"files", "skeleton", "subject", "version"},
     "evaluation": VALUES | {"carving", "files", "export", "skeleton", "subject"},
-    "inspection": VALUES | {"files", "export", "evaluation"},
+    "inspection": VALUES | {"files", "export", "evaluation", "subject"},
 }
 ROOMS["config"] = set(ROOMS)
 ROOMS["pipeline"] = set(ROOMS)

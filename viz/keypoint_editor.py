@@ -24,6 +24,7 @@ from viz.keypoint_marks import BRIDGED, CHOSEN, LINK, MEASURED
 from viz.keypoint_panel import Panel
 from viz.keypoint_scene import POINTS, Subject, marks_of
 from viz.keypoint_session import Follower, Session, pick_ball, pick_surface
+from viz.own_pages import own_pages_only
 
 _FIELD_DEG = 32.0  # field of view that the whole motion fills at first
 
@@ -64,7 +65,7 @@ class KeyPointEditor:
         viser = require("viser", extra="editor", purpose="Editing key-points in the browser")
         self.subject, self.follow, self.session, self.save = subject, follow, session, save
         self._to_quaternion = lambda R: viser.transforms.SO3.from_matrix(R).wxyz
-        with contextlib.redirect_stdout(io.StringIO()):
+        with contextlib.redirect_stdout(io.StringIO()), own_pages_only(host):
             self.server = viser.ViserServer(host=host, port=port, label="geomocap key-points", verbose=False)
         self._lock = threading.RLock()
         self._dragged: Session | None = None  # as it was when the handles were grabbed

@@ -148,7 +148,8 @@ class Panel:
 
     def say(self, words: str, wrong: bool = False) -> None:
         """Show a line below the buttons."""
-        self._status.content = f"⚠ {words}" if wrong else words
+        said = escape(words)
+        self._status.content = f"⚠ {said}" if wrong else said
 
     def picture(self, image: np.ndarray | None) -> None:
         """Show a picture in the panel, or none."""

@@ -6,11 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import open3d as o3d
+import trimesh
 
 from geomocap.errors import GeometryError, RunError
 from geomocap.files.frame_files import read_points
+from geomocap.files.geometry_claims import check_geometry
 from geomocap.files.open3d_geometry import read_by_open3d
+from geomocap.files.scan_checks import check_points
+from geomocap.files.scan_geometry import read_mesh
 from geomocap.model.surface import vertex_normals
+from geomocap.reading import open_plain
 from viz.body_colors import body_colors
 from viz.drawing import sheet, write_png
 from viz.floor import floor
@@ -41,6 +46,7 @@ def load(path: Path) -> Mesh:
         raise GeometryError(f"{path}: no such file")
     if ending not in {*MESHES, *CLOUDS}:
         raise GeometryError(f"{path}: can't be shown; expected {', '.join(sorted({*MESHES, *CLOUDS}))}")
+    check_geometry(path)
     if ending == ".ply" and _is_voxel_grid(path):
         grid = read_by_open3d(o3d.io.read_voxel_grid, path)
         voxels = grid.get_voxels()
@@ -50,29 +56,37 @@ def load(path: Path) -> Mesh:
         colors = np.array([v.color for v in voxels]).reshape(-1, 3) * 255
         return cubes(indices, np.asarray(grid.origin), grid.voxel_size, colors)
     if ending in MESHES:
-        found = read_by_open3d(o3d.io.read_triangle_mesh, path)
-        if found.has_triangles():
-            return _triangles(found)
+        found = read_mesh(path)
+        if found is not None:
+            return _triangles(found, path)
     if ending not in CLOUDS:
         raise GeometryError(f"{path}: holds no triangles; is it truncated?")
     try:
         points = read_points(path).finite
     except GeometryError:
         raise GeometryError(f"{path}: holds neither triangles nor points; is it whole?") from None
+    check_points(points.positions, str(path))
     colors = body_colors(points.body) if (points.body >= 0).any() else points.shown_colors
     return gems(points.positions, colors, 0.75 * spacing(points.positions), points.normals)
 
 
 def _is_voxel_grid(path: Path) -> bool:
-    with path.open("rb") as file:
+    with open_plain(path) as file:
         return b"voxel_size" in file.read(4096).split(b"end_header")[0]
 
 
-def _triangles(found: o3d.geometry.TriangleMesh) -> Mesh:
-    vertices, faces = np.asarray(found.vertices), np.asarray(found.triangles).astype(np.int64)
+def _triangles(found: trimesh.Trimesh, path: Path) -> Mesh:
+    vertices, faces = np.asarray(found.vertices, float), np.asarray(found.faces).astype(np.int64)
+    good = np.isfinite(vertices[faces]).all(axis=(1, 2))
+    kept = np.unique(faces[good])
+    check_points(vertices[kept], str(path))
+    a, b, c = vertices[faces[good]].swapaxes(0, 1)
+    if not np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() > 0:
+        raise GeometryError(f"{path}: its triangles have no area; is it whole?")
+    vertices, faces = np.where(np.isfinite(vertices), vertices, vertices[kept[0]]), faces[good]
     colors = np.full((len(faces), 3), (0.62, 0.66, 0.72))
-    if found.has_vertex_colors():
-        colors = np.asarray(found.vertex_colors)[faces].mean(axis=1)
+    if found.visual.kind == "vertex":
+        colors = np.asarray(found.visual.vertex_colors)[faces][..., :3].mean(axis=1) / 255
     return Mesh(vertices, faces, vertex_normals(vertices, faces), colors)
 
 

@@ -7,18 +7,18 @@ and metres.
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 
 import numpy as np
 import tomli_w
 from scipy.spatial.transform import Rotation
 
-from data_tools.calibration_files.opencv_cameras import camera_from_opencv, camera_to_opencv, read_text
+from data_tools.calibration_files.opencv_cameras import camera_from_opencv, camera_to_opencv
 from data_tools.calibration_files.plausibility import check_rig, check_size, in_metres, rotation_matrix
 from geomocap.errors import CalibrationError
 from geomocap.files.atomic import write_text
 from geomocap.model.rig import Rig
+from geomocap.reading import read_toml, reason
 
 
 def read_aniposelib(path: Path, metres_per_unit: float = 1.0) -> Rig:
@@ -39,10 +39,7 @@ def read_aniposelib(path: Path, metres_per_unit: float = 1.0) -> Rig:
         If the file is no TOML, holds no camera, lacks something, or its convention or unit is evidently another.
     """
     path = Path(path)
-    try:
-        content = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise CalibrationError(f"{path}: not valid TOML ({error})") from None
+    content = read_toml(path, CalibrationError, "give a calibration file")
     nested = content.get("cameras")
     tables = nested if isinstance(nested, dict) else content
     names, cameras, poses = [], [], []
@@ -63,8 +60,8 @@ def read_aniposelib(path: Path, metres_per_unit: float = 1.0) -> Rig:
             distortions = [float(v) for v in np.ravel(table.get("distortions", []))]
             turn = np.array(table["rotation"], dtype=float)
             t = np.array(table["translation"], dtype=float).reshape(3)
-        except (TypeError, ValueError) as error:
-            raise CalibrationError(f"{where}: numbers missing or misplaced ({error})") from None
+        except (TypeError, ValueError, OverflowError) as error:
+            raise CalibrationError(f"{where}: numbers missing or misplaced ({reason(error)})") from None
         if turn.size == 3:
             R = Rotation.from_rotvec(turn.reshape(3)).as_matrix()
         else:
@@ -79,7 +76,7 @@ def read_aniposelib(path: Path, metres_per_unit: float = 1.0) -> Rig:
         poses.append(np.column_stack([R, in_metres(t, metres_per_unit, str(path))]))
     if not names:
         raise CalibrationError(f"{path}: holds no camera (a table with `matrix`); is it an aniposelib calibration?")
-    rig = Rig(tuple(names), tuple(cameras), np.array(poses))
+    rig = Rig.of_file(str(path), names, cameras, np.array(poses))
     check_rig(rig, str(path))
     return rig
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.calibration_files.plausibility import check_rig, in_metres
-from geomocap.errors import RunError
-from geomocap.files.rigs import colmap_model, read_rig
+from geomocap.files.rigs import read_rig, write_rig
 from geomocap.model.rig import Rig
 
 
@@ -32,7 +31,7 @@ def read_colmap(folder: Path, metres_per_unit: float = 1.0) -> Rig:
     rig = read_rig(model)
     poses = np.array(rig.cam_from_world)
     poses[:, :, 3] = in_metres(poses[:, :, 3], metres_per_unit, str(model))
-    rig = Rig(rig.names, rig.cameras, poses)
+    rig = Rig.of_file(str(model), rig.names, rig.cameras, poses, rig.notes)
     check_rig(rig, str(model))
     return rig
 
@@ -45,12 +44,4 @@ def write_colmap(rig: Rig, folder: Path, *, binary: bool = False) -> None:
     RunError
         If the folder can't be written.
     """
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if binary:
-            colmap_model(rig).write_binary(str(folder))
-        else:
-            colmap_model(rig).write_text(str(folder))
-    except OSError as error:
-        raise RunError(f"{folder}: can't be written ({error.strerror or error})") from None
+    write_rig(Path(folder), rig, binary=binary)

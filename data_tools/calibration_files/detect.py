@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
 from data_tools.calibration_files.aniposelib import read_aniposelib
 from data_tools.calibration_files.colmap import read_colmap
-from data_tools.calibration_files.opencv_cameras import read_text
 from data_tools.calibration_files.opencv_yaml import MATRIX_KEYS, read_easymocap, read_opencv
 from data_tools.calibration_files.pose2sim import read_pose2sim
 from data_tools.calibration_files.qualisys import read_qualisys
 from geomocap.errors import CalibrationError
 from geomocap.model.rig import Rig
+from geomocap.reading import open_plain, parse_toml, read_text
 
 Kind = Literal["colmap", "easymocap", "opencv", "qualisys", "pose2sim", "aniposelib"]
 
@@ -38,7 +37,7 @@ def detect_format(path: Path) -> Kind:
             return "easymocap"
         for file in sorted(path.glob("*")):
             if file.suffix.lower() in (".yml", ".yaml", ".xml", ".json"):
-                head = file.read_text(encoding="utf-8", errors="replace")[:4000]
+                head = _beginning(file)
                 if any(key in head for key in MATRIX_KEYS):
                     return "opencv"
         raise CalibrationError(
@@ -46,17 +45,14 @@ def detect_format(path: Path) -> Kind:
         )
     if path.name in ("intri.yml", "extri.yml"):
         return "easymocap"
-    text = read_text(path)
+    text = read_text(path, CalibrationError, "give a calibration file")
     if "<calibration" in text and "focalLengthU" in text:
         return "qualisys"
     if path.suffix.lower() == ".toml":
-        try:
-            tables = [t for t in tomllib.loads(text).values() if isinstance(t, dict)]
-        except tomllib.TOMLDecodeError as error:
-            raise CalibrationError(f"{path}: not valid TOML ({error})") from None
-        if any("matrix" in t and "fisheye" in t and len(t.get("rotation", ())) == 3 for t in tables):
+        tables = [t for t in parse_toml(text, path, CalibrationError).values() if isinstance(t, dict)]
+        if any("matrix" in t and "fisheye" in t and _is_vector(t.get("rotation")) for t in tables):
             rows = [t["rotation"] for t in tables if "matrix" in t and "rotation" in t]
-            if all(isinstance(r[0], int | float) for r in rows):
+            if all(map(_is_vector, rows)):
                 return "pose2sim"
         if any("matrix" in t for t in tables) or any(
             isinstance(v, dict) and "matrix" in v for t in tables for v in t.values()
@@ -66,6 +62,18 @@ def detect_format(path: Path) -> Kind:
         f"{path}: no calibration recognised; known are COLMAP, aniposelib, caliscope and Pose2Sim TOML, Qualisys XML, "
         "EasyMocap and OpenCV YAML"
     )
+
+
+def _beginning(file: Path) -> str:
+    try:
+        with open_plain(file) as stream:
+            return stream.read(4000).decode("utf-8", "replace")
+    except OSError as error:
+        raise CalibrationError(f"{file}: can't be read ({error.strerror})") from None
+
+
+def _is_vector(value: object) -> bool:
+    return isinstance(value, list) and len(value) == 3 and isinstance(value[0], int | float)
 
 
 def read_calibration(

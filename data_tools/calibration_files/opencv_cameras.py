@@ -7,12 +7,12 @@ shifted by half a pixel on the way in and back on the way out; nothing else chan
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from geomocap.errors import CalibrationError
+from geomocap.model.orientations import LONGEST_SIDE
 
 HALF_PIXEL = 0.5
 
@@ -37,6 +37,8 @@ def camera_from_opencv(
         If the matrix has skew, is transposed or has no focal length, or the number of coefficients is not one of
         these.
     """
+    if not (0 < width <= LONGEST_SIDE and 0 < height <= LONGEST_SIDE):
+        raise CalibrationError(f"{where}: an image of {width}×{height} pixels can't be; correct its size")
     K = np.asarray(matrix, dtype=float)
     if K.shape != (3, 3) or not np.isfinite(K).all():
         raise CalibrationError(f"{where}: the camera matrix must be 3×3 finite numbers, got shape {K.shape}")
@@ -90,19 +92,3 @@ def camera_to_opencv(camera: pycolmap.Camera) -> tuple[np.ndarray, list[float], 
     if name in ("OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"):
         return K, p[4:], name == "OPENCV_FISHEYE"
     raise CalibrationError(f"a camera of COLMAP's model {name} can't be written for OpenCV; convert it to OPENCV")
-
-
-def read_text(path: Path) -> str:
-    """Read a calibration file as text.
-
-    Raises
-    ------
-    CalibrationError
-        If it can't be read.
-    """
-    try:
-        return path.read_text(encoding="utf-8", errors="strict")
-    except OSError as error:
-        raise CalibrationError(f"{path}: can't be read ({error.strerror}); give a calibration file") from None
-    except UnicodeDecodeError:
-        raise CalibrationError(f"{path}: not a text file; give a calibration file") from None

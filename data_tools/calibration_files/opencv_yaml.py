@@ -7,6 +7,7 @@ EasyMocap names its matrices `K_<camera>`, `dist_<camera>`, `R_<camera>` (Rodrig
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -15,16 +16,20 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from data_tools.calibration_files.opencv_cameras import camera_from_opencv, camera_to_opencv, read_text
+from data_tools.calibration_files.opencv_cameras import camera_from_opencv, camera_to_opencv
+from data_tools.calibration_files.opencv_text import read_opencv_file
 from data_tools.calibration_files.plausibility import check_rig, check_size, in_metres, rotation_matrix
 from geomocap.errors import CalibrationError
 from geomocap.files.atomic import write_text
 from geomocap.model.rig import Rig
+from geomocap.reading import harmless
 
 MATRIX_KEYS = ("camera_matrix", "cameraMatrix", "K", "intrinsic_matrix", "M")
 DISTORTION_KEYS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "dist", "D")
 ROTATION_KEYS = ("R", "rotation_matrix", "rvec", "rotation_vector", "rotation")
 TRANSLATION_KEYS = ("T", "t", "tvec", "translation_vector", "translation")
+
+_KEY_PART = re.compile(r"[A-Za-z0-9_-]+")  # of which OpenCV lets keys be made
 
 
 def read_easymocap(
@@ -46,35 +51,34 @@ def read_easymocap(
         If a file is missing or no YAML, a camera lacks something, or its convention is evidently another.
     """
     folder = Path(folder)
-    intrinsic, extrinsic = _open(folder / "intri.yml"), _open(folder / "extri.yml")
-    names = _strings(intrinsic.getNode("names")) or _strings(extrinsic.getNode("names"))
+    intrinsic, extrinsic = read_opencv_file(folder / "intri.yml"), read_opencv_file(folder / "extri.yml")
+    names = intrinsic.texts("names") or extrinsic.texts("names")
     if not names:
         raise CalibrationError(f"{folder / 'intri.yml'}: lists no cameras (`names`); is it an EasyMocap calibration?")
     cameras, poses = [], []
     for name in names:
         where = f"{folder}: camera {name}"
-        K, d = intrinsic.getNode(f"K_{name}").mat(), intrinsic.getNode(f"dist_{name}").mat()
-        if d is None:
-            d = intrinsic.getNode(f"D_{name}").mat()
+        K, d = intrinsic.matrix(f"K_{name}"), intrinsic.matrix(f"dist_{name}", f"D_{name}")
         if K is None or d is None:
             raise CalibrationError(f"{where}: intri.yml has no K_{name} and dist_{name}")
-        width, height = (int(intrinsic.getNode(f"{k}_{name}").real()) for k in "WH")
+        width, height = (intrinsic.number(f"{k}_{name}") for k in "WH")
         if width <= 0 or height <= 0:
             if sizes is None or name not in sizes:
                 raise CalibrationError(f"{where}: intri.yml does not say its image size; give it")
             width, height = sizes[name]
         cameras.append(_camera(K, d, width, height, where))
-        R, r = extrinsic.getNode(f"Rot_{name}").mat(), extrinsic.getNode(f"R_{name}").mat()
-        t = extrinsic.getNode(f"T_{name}").mat()
+        R, r, t = (extrinsic.matrix(f"{k}_{name}") for k in ("Rot", "R", "T"))
         if t is None or (R is None and r is None):
             raise CalibrationError(f"{where}: extri.yml has no R_{name} or Rot_{name}, and T_{name}")
-        poses.append(_pose(R if R is not None else r, t, metres_per_unit, where))
+        turn_given = R if R is not None else r
+        assert turn_given is not None
+        poses.append(_pose(turn_given, t, metres_per_unit, where))
         if R is not None and r is not None and r.size == 3:
             turn = Rotation.from_rotvec(np.ravel(r)).as_matrix()
             if np.abs(turn - R).max() > 1e-4:
                 what = "the transpose of" if np.abs(turn.T - R).max() < 1e-4 else "another rotation than"
                 raise CalibrationError(f"{where}: in extri.yml Rot_{name} is {what} R_{name}")
-    rig = Rig(tuple(names), tuple(cameras), np.array(poses))
+    rig = Rig.of_file(str(folder), names, cameras, np.array(poses))
     check_rig(rig, str(folder))
     return rig
 
@@ -87,6 +91,11 @@ def write_easymocap(rig: Rig, folder: Path) -> None:
     CalibrationError
         If a camera is a fisheye, which EasyMocap does not know.
     """
+    for name in rig.names:
+        if not _KEY_PART.fullmatch(name):
+            raise CalibrationError(
+                f"camera {harmless(name)}: EasyMocap's files can't hold this name; use letters, digits, - and _"
+            )
     intrinsic, extrinsic = _new(), _new()
     for storage in (intrinsic, extrinsic):
         storage.startWriteStruct("names", cv2.FileNode_SEQ)
@@ -124,16 +133,16 @@ def read_opencv(folder: Path, metres_per_unit: float = 1.0) -> Rig:
     files = sorted(f for f in folder.glob("*") if f.suffix.lower() in endings and not f.name.startswith("."))
     names, cameras, poses = [], [], []
     for file in files:
-        storage = _open(file)
-        K = _first(storage, MATRIX_KEYS)
+        storage = read_opencv_file(file)
+        K = storage.matrix(*MATRIX_KEYS)
         if K is None:
             continue
         where = str(file)
-        d = _first(storage, DISTORTION_KEYS)
-        R, t = _first(storage, ROTATION_KEYS), _first(storage, TRANSLATION_KEYS)
+        d = storage.matrix(*DISTORTION_KEYS)
+        R, t = storage.matrix(*ROTATION_KEYS), storage.matrix(*TRANSLATION_KEYS)
         if R is None or t is None:
             raise CalibrationError(f"{where}: has no pose (R or rvec, and T or tvec)")
-        width, height = (int(storage.getNode(k).real()) for k in ("image_width", "image_height"))
+        width, height = (storage.number(k) for k in ("image_width", "image_height"))
         if width <= 0 or height <= 0:
             raise CalibrationError(f"{where}: does not say image_width and image_height")
         names.append(file.stem)
@@ -141,7 +150,7 @@ def read_opencv(folder: Path, metres_per_unit: float = 1.0) -> Rig:
         poses.append(_pose(R, t, metres_per_unit, where))
     if not names:
         raise CalibrationError(f"{folder}: holds no OpenCV calibration (<camera>.yml with camera_matrix)")
-    rig = Rig(tuple(names), tuple(cameras), np.array(poses))
+    rig = Rig.of_file(str(folder), names, cameras, np.array(poses))
     check_rig(rig, str(folder))
     return rig
 
@@ -168,27 +177,6 @@ def write_opencv(rig: Rig, folder: Path) -> None:
 
 def _new() -> cv2.FileStorage:
     return cv2.FileStorage(".yml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
-
-
-def _open(file: Path) -> cv2.FileStorage:
-    text = read_text(file)
-    try:
-        return cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-    except (cv2.error, SystemError) as error:
-        reason = str(error).strip().splitlines()[-1][:120]
-        raise CalibrationError(f"{file}: no readable OpenCV file ({reason})") from None
-
-
-def _strings(node: cv2.FileNode) -> list[str]:
-    return [node.at(k).string() for k in range(node.size())] if not node.empty() and node.isSeq() else []
-
-
-def _first(storage: cv2.FileStorage, keys: tuple[str, ...]) -> np.ndarray | None:
-    for key in keys:
-        node = storage.getNode(key)
-        if not node.empty() and node.mat() is not None:
-            return node.mat()
-    return None
 
 
 def _camera(K: np.ndarray, d: np.ndarray, width: int, height: int, where: str) -> pycolmap.Camera:

@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 
 from geomocap.errors import CalibrationError
+from geomocap.model.orientations import nearest_rotation
 from geomocap.model.rig import Rig
 
 FARTHEST = 60.0
@@ -16,7 +17,7 @@ NEAREST = 0.02
 
 
 def rotation_matrix(values: object, where: str) -> np.ndarray:
-    """Check a rotation matrix from a file and make it exactly orthonormal.
+    """Check a rotation matrix from a file; a `Rig` makes it exactly orthonormal.
 
     Parameters
     ----------
@@ -30,21 +31,8 @@ def rotation_matrix(values: object, where: str) -> np.ndarray:
         If it is no rotation, or mirrors the world.
     """
     R = np.asarray(values, dtype=np.float64)
-    if R.shape != (3, 3) or not np.isfinite(R).all():
-        raise CalibrationError(f"{where}: the rotation must be 3×3 finite numbers, got shape {R.shape}")
-    U, _, Vt = np.linalg.svd(R)
-    nearest = U @ Vt
-    if np.abs(nearest - R).max() > 1e-3:
-        raise CalibrationError(
-            f"{where}: its rotation is not orthonormal (off by {np.abs(nearest - R).max():.2g}); "
-            "are rows and translation mixed up?"
-        )
-    if np.linalg.det(nearest) < 0:
-        raise CalibrationError(
-            f"{where}: its rotation mirrors the world (determinant −1); "
-            "an axis was flipped when it was written, flip it back"
-        )
-    return R if np.abs(nearest - R).max() < 1e-12 else nearest
+    nearest_rotation(R, where)
+    return R
 
 
 def check_size(camera: pycolmap.Camera, where: str) -> None:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 
 import numpy as np
 import tomli_w
 from scipy.spatial.transform import Rotation
 
-from data_tools.calibration_files.opencv_cameras import camera_from_opencv, camera_to_opencv, read_text
+from data_tools.calibration_files.opencv_cameras import camera_from_opencv, camera_to_opencv
 from geomocap.errors import CalibrationError
 from geomocap.files.atomic import write_text
 from geomocap.model.rig import Rig
+from geomocap.reading import read_toml, reason
 
 
 def read_pose2sim(path: Path) -> Rig:
@@ -28,10 +28,7 @@ def read_pose2sim(path: Path) -> Rig:
         If the file is no TOML, holds no camera, or one lacks something.
     """
     path = Path(path)
-    try:
-        tables = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise CalibrationError(f"{path}: not valid TOML ({error})") from None
+    tables = read_toml(path, CalibrationError, "give a calibration file")
     names, cameras, poses = [], [], []
     for key, table in tables.items():
         if not isinstance(table, dict) or "matrix" not in table:
@@ -46,15 +43,15 @@ def read_pose2sim(path: Path) -> Rig:
             distortions = [float(v) for v in table.get("distortions", [])]
             R = Rotation.from_rotvec(np.array(table["rotation"], dtype=float).reshape(3)).as_matrix()
             t = np.array(table["translation"], dtype=float).reshape(3)
-        except (TypeError, ValueError) as error:
-            raise CalibrationError(f"{where}: numbers missing or misplaced ({error})") from None
+        except (TypeError, ValueError, OverflowError) as error:
+            raise CalibrationError(f"{where}: numbers missing or misplaced ({reason(error)})") from None
         fisheye = bool(table.get("fisheye", False))
         cameras.append(camera_from_opencv(matrix, distortions, width, height, fisheye=fisheye, where=where))
         names.append(str(table.get("name", key)))
         poses.append(np.column_stack([R, t]))
     if not names:
         raise CalibrationError(f"{path}: holds no camera (a table with `matrix`); is it a Pose2Sim calibration?")
-    return Rig(tuple(names), tuple(cameras), np.array(poses))
+    return Rig.of_file(str(path), names, cameras, np.array(poses))
 
 
 def write_pose2sim(rig: Rig, path: Path) -> None:

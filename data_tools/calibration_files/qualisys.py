@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
-from data_tools.calibration_files.opencv_cameras import HALF_PIXEL, read_text
+from data_tools.calibration_files.opencv_cameras import HALF_PIXEL
 from geomocap.errors import CalibrationError
+from geomocap.model.orientations import LONGEST_SIDE, NOTED, nearest_rotation
 from geomocap.model.rig import Rig
+from geomocap.reading import read_text, reason
 
 SUBPIXELS = 64.0
 
@@ -32,22 +35,25 @@ def read_qualisys(path: Path) -> Rig:
         If the file is no such XML, holds no camera, or lacks something, or the sensor is turned (viewrotation).
     """
     path = Path(path)
-    text = read_text(path)
+    text = read_text(path, CalibrationError, "give a calibration file")
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise CalibrationError(f"{path}: has a document type or entities, which a Qualisys calibration never has")
     try:
         root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise CalibrationError(f"{path}: no readable XML ({error}); export the calibration from QTM again") from None
+    except (ElementTree.ParseError, ValueError, RecursionError) as error:
+        raise CalibrationError(
+            f"{path}: no readable XML ({reason(error)}); export the calibration from QTM again"
+        ) from None
     names: list[str] = []
     cameras: list[pycolmap.Camera] = []
     poses: list[np.ndarray] = []
+    notes: list[str] = []
     for node in root.iter("camera"):
         if node.get("active", "1") != "1":
             continue
         name = node.get("serial") or f"cam{len(names) + 1:02d}"
         where = f"{path}: camera {name}"
-        if float(node.get("viewrotation", "0")) != 0:
+        if "viewrotation" in node.attrib and _number(node, "viewrotation", where) != 0:
             raise CalibrationError(f"{where}: viewrotation is not 0; export the calibration without rotated views")
         intrinsic, transform = _part(node, "intrinsic", where), _part(node, "transform", where)
         view = node.find("fov_video")
@@ -62,6 +68,10 @@ def read_qualisys(path: Path) -> Rig:
         k1, k2, k3 = (_number(intrinsic, f"radialDistortion{k}", where) for k in (1, 2, 3))
         p1, p2 = (_number(intrinsic, f"tangentalDistortion{k}", where) for k in (1, 2))
         params = [fx, fy, cx, cy, k1, k2, p1, p2]
+        if not (0 <= right - left < LONGEST_SIDE and 0 <= bottom - top < LONGEST_SIDE):
+            raise CalibrationError(
+                f"{where}: its view, {left:g} to {right:g} by {top:g} to {bottom:g}, can't be an image"
+            )
         model = "OPENCV" if k3 == 0 else "FULL_OPENCV"
         cameras.append(
             pycolmap.Camera(
@@ -73,14 +83,14 @@ def read_qualisys(path: Path) -> Rig:
         )
         R = np.diag([1.0, -1.0, -1.0]) @ [[_number(transform, f"r{i}{j}", where) for j in "123"] for i in "123"]
         center = np.array([_number(transform, k, where) for k in "xyz"]) / 1000.0
-        u, _, vt = np.linalg.svd(R)  # printed with few digits in some versions
-        if np.abs(u @ vt - R).max() > 1e-3:
-            raise CalibrationError(f"{where}: its rotation is not orthonormal; export the calibration from QTM again")
+        nearest, off = nearest_rotation(R, where)  # printed with few digits in some versions
+        if off > NOTED:
+            notes.append(f"camera {name}: its rotation is orthonormal to {off:.1g} only; the nearest rotation is taken")
         names.append(name)
-        poses.append(np.column_stack([u @ vt, -(u @ vt) @ center]))
+        poses.append(np.column_stack([nearest, -nearest @ center]))
     if not names:
         raise CalibrationError(f"{path}: holds no active camera; is it a Qualisys calibration?")
-    return Rig(tuple(names), tuple(cameras), np.array(poses))
+    return Rig.of_file(str(path), names, cameras, np.array(poses), notes)
 
 
 def _part(node: ElementTree.Element, tag: str, where: str) -> ElementTree.Element:
@@ -92,6 +102,9 @@ def _part(node: ElementTree.Element, tag: str, where: str) -> ElementTree.Elemen
 
 def _number(node: ElementTree.Element, key: str, where: str) -> float:
     try:
-        return float(node.attrib[key])
+        value = float(node.attrib[key])
     except (KeyError, ValueError):
-        raise CalibrationError(f"{where}: <{node.tag}> has no number {key}; export it from QTM again") from None
+        value = math.nan
+    if not math.isfinite(value):
+        raise CalibrationError(f"{where}: <{node.tag}> has no number {key}; export it from QTM again")
+    return value

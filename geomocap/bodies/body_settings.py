@@ -11,7 +11,11 @@ class MotionBodiesSettings(Settings):
     """How rigid bodies are found from motion paths."""
 
     bodies: int = Field(
-        default=0, ge=0, description="number of bodies; 0: found automatically", json_schema_extra={"flag": "bodies"}
+        default=0,
+        ge=0,
+        le=100,
+        description="number of bodies; 0: found automatically",
+        json_schema_extra={"flag": "bodies"},
     )
     min_turn_deg: float = Field(
         default=15.0,
@@ -51,7 +55,7 @@ class MotionBodiesSettings(Settings):
         description="soft skin between two bodies differs from a blend of them by up to this fraction of how far they "
         "carry it apart (0..1); 0 where samples move with rigid parts",
     )
-    neighbours: int = Field(default=10, ge=4, description="neighbours of a sample on the surface")
+    neighbours: int = Field(default=10, ge=4, le=1000, description="neighbours of a sample on the surface")
     max_stretch: float = Field(
         default=2.0, gt=1, description="neighbours that separate more are none (times the usual distance)"
     )
@@ -61,6 +65,7 @@ class MotionBodiesSettings(Settings):
     depth_rounds: int = Field(
         default=2,
         ge=0,
+        le=1000,
         description="times that depths of what single cameras see are found from the bodies, and bodies from these",
     )
     blends: bool = Field(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,8 @@ from geomocap.files.capture import check_links, read_capture_info
 from geomocap.files.images import IMAGE_ENDINGS, read_image
 from geomocap.model.rig import Rig
 from geomocap.progress import Progress, silent
-from geomocap.settings import Settings
+from geomocap.reading import read_toml
+from geomocap.settings import Settings, explained
 
 
 class LShape(Settings):
@@ -106,14 +106,11 @@ def with_l_shape(
         If two cameras don't find its three targets.
     """
     file = folder / "reference.toml"
+    hint = "it must say long_arm and short_arm, metres"
     try:
-        shape = LShape(**tomllib.loads(file.read_text(encoding="utf-8")))
-    except OSError as error:
-        raise CaptureError(f"{file}: can't be read ({error.strerror}); it must say long_arm and short_arm") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValidationError) as error:
-        raise CaptureError(
-            f"{file}: {str(error).splitlines()[0]}; it must say long_arm and short_arm, metres"
-        ) from None
+        shape = LShape(**read_toml(file, CaptureError, hint))
+    except ValidationError as error:
+        raise CaptureError(f"{file}: {explained(error)}; {hint}") from None
     candidates = np.full((len(cameras), 3, 2), np.nan)
     images = 0
     for c, name in enumerate(cameras):

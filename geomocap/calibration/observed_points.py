@@ -82,7 +82,7 @@ def read_observed(path: Path) -> Observed:
             points.append(row[point].strip())
             pixels.append((float(row[x]) + shift, float(row[y]) + shift))
             sigmas.append(float(row.get("sigma") or "nan"))
-        except (ValueError, AttributeError, TypeError, KeyError):
+        except (ValueError, AttributeError, TypeError, KeyError, OverflowError):
             raise CalibrationError(f"{path}: line {number} is no observation: {row}") from None
         if not np.isfinite(pixels[-1]).all():
             raise CalibrationError(f"{path}: line {number}: x and y must be numbers")

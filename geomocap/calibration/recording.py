@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import tomllib
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import Field, ValidationError
@@ -18,8 +18,9 @@ from geomocap.files.capture import FrameSource
 from geomocap.files.images import IMAGE_ENDINGS, ImageFolder
 from geomocap.files.videos import VIDEO_ENDINGS, Video
 from geomocap.progress import Progress, silent
+from geomocap.reading import check_name, list_folder, read_toml
 from geomocap.scheduling import map_items, threads
-from geomocap.settings import Settings
+from geomocap.settings import Settings, explained
 
 
 class BarInfo(Settings):
@@ -74,16 +75,19 @@ class Recording:
         info = read_bar_info(folder / "bar.toml", length)
         sources: dict[str, FrameSource] = {}
         numbers: dict[str, np.ndarray] = {}
-        for sub in sorted(p for p in folder.iterdir() if p.is_dir()):
-            files = tuple(sorted(f for f in sub.iterdir() if f.suffix.lower() in IMAGE_ENDINGS and f.name[0] != "."))
+        entries = list_folder(folder, CaptureError)
+        for sub in (p for p in entries if p.is_dir()):
+            found = list_folder(sub, CaptureError)
+            files = tuple(f for f in found if f.suffix.lower() in IMAGE_ENDINGS and f.name[0] != ".")
             if not files:
                 continue
-            wrong = next((f for f in files if not f.stem.isdigit()), None)
+            wrong = next((f for f in files if not f.stem.isdecimal()), None)
             if wrong is not None:
                 raise CaptureError(f"{wrong}: expected a frame number as name (000000.png)")
+            check_name(sub.name, str(folder), CaptureError)
             sources[sub.name] = ImageFolder(files)
             numbers[sub.name] = np.array([int(f.stem) for f in files])
-        for file in sorted(folder.iterdir()):
+        for file in entries:
             if file.suffix.lower() in VIDEO_ENDINGS and file.stem not in sources:
                 video = Video(file)
                 sources[file.stem], numbers[file.stem] = video, np.arange(len(video))
@@ -104,18 +108,13 @@ class Recording:
 
 def read_bar_info(file: Path, length: float | None = None) -> BarInfo:
     """Read and check `bar.toml`; a given length goes before the file's, and makes do without the file."""
+    values: dict[str, Any] = {}
+    if file.exists() or length is None:
+        values = read_toml(file, CaptureError, "it must say `length = …`, metres between the target centres")
     try:
-        values = tomllib.loads(file.read_text(encoding="utf-8")) if file.exists() or length is None else {}
         return BarInfo(**{**values, **({"length": length} if length is not None else {})})
-    except OSError as error:
-        raise CaptureError(
-            f"{file}: can't be read ({error.strerror}); it must say `length = …`, metres between the target centres"
-        ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CaptureError(f"{file}: not valid TOML ({error})") from None
     except ValidationError as error:
-        first = error.errors()[0]
-        raise CaptureError(f"{file}: {'.'.join(str(p) for p in first['loc'])}: {first['msg']}") from None
+        raise CaptureError(f"{file}: {explained(error)}") from None
 
 
 def measure(

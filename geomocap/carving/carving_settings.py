@@ -60,7 +60,7 @@ class ConsistencySettings(Settings):
         description="fraction of the judged surface voxels around it that must be inconsistent too (0–1)",
     )
     max_passes: int = Field(
-        default=6, ge=1, description="carving passes; each takes at most one layer of voxels (count)"
+        default=6, ge=1, le=1000, description="carving passes; each takes at most one layer of voxels (count)"
     )
     gain: bool = Field(default=True, description="estimate one brightness factor a camera and colour channel first")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 
@@ -9,12 +10,29 @@ def main() -> None:
     """Run the command line; a mistake of the user's ends with one clear line and exit status 1."""
     from geomocap.cli.app import app
     from geomocap.errors import GeomocapError
+    from geomocap.reading import reason
 
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # what it stumbles over, the one line says
     try:
         app()
     except GeomocapError as error:
-        print(f"geomocap: {' '.join(str(error).split())}", file=sys.stderr)  # noqa: T201
-        sys.exit(1)
+        _fail(str(error))
+    except OSError as error:
+        if error.filename is None:
+            raise
+        _fail(f"{os.fsdecode(error.filename)}: {reason(error)}")
+    except MemoryError:
+        _fail("there is not memory enough; use smaller images, a coarser resolution or fewer --workers")
     except KeyboardInterrupt:
         print("geomocap: interrupted; start it again to go on from what is finished", file=sys.stderr)  # noqa: T201
         sys.exit(130)
+
+
+def _fail(text: str) -> None:
+    """Say in one line what is wrong, whatever characters its names have, and end with exit status 1."""
+    from geomocap.reading import harmless
+
+    line = harmless(" ".join(text.split()))
+    encoding = sys.stderr.encoding or "utf-8"
+    print("geomocap: " + line.encode(encoding, "backslashreplace").decode(encoding), file=sys.stderr)  # noqa: T201
+    sys.exit(1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -24,10 +25,17 @@ ModelFile = Annotated[
         "--model", metavar="FILE.npz", help="Model of the subject, model.npz of another run: it is followed instead."
     ),
 ]
+Wait = Annotated[bool, typer.Option("--wait", help="If another process works in RUN, wait until it has ended.")]
 Pictures = Annotated[bool, typer.Option(help="Make review pictures and the report.")]
 Workers = Annotated[
     int | None,
-    typer.Option("--workers", min=1, callback=_limited, help="Threads to use; one for each core if not given."),
+    typer.Option(
+        "--workers",
+        min=1,
+        max=max(256, 4 * (os.cpu_count() or 1)),
+        callback=_limited,
+        help="Threads to use; one for each core if not given.",
+    ),
 ]
 Scheduler = Annotated[
     str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to map frames on, tcp://host:8786.")

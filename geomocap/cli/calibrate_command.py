@@ -25,6 +25,8 @@ from geomocap.errors import CalibrationError, CaptureError, GeomocapError
 from geomocap.files.capture import Capture, read_capture_info
 from viz.calibration_report import write_calibration_report
 
+LAST_FRAME = 999_999  # names of frames have six digits
+
 
 @with_options_of(BarSettings)
 def calibrate(
@@ -79,6 +81,8 @@ def calibrate(
 
     Example: `geomocap calibrate studio --distance 0.5 --floor 0-5`
     """
+    if ends and points is None:
+        raise CalibrationError("--ends names points of a table; give it by --points")
     check_replaceable(capture / "sparse", force)
     world = WorldKnowledge(
         rig=None if align is None else read_calibration(align),
@@ -150,8 +154,10 @@ def _frames(text: str) -> tuple[int, ...]:
     out: list[int] = []
     for part in text.split(","):
         first, _, last = part.strip().partition("-")
-        if not first.isdigit() or (last and not last.isdigit()):
+        if not first.isdecimal() or (last and not last.isdecimal()):
             raise GeomocapError(f"--floor {text}: expected frame numbers such as 0-3,17")
+        if int(first) > int(last or first) or int(last or first) > LAST_FRAME:
+            raise GeomocapError(f"--floor {text}: {part.strip()} are no frames; expected numbers such as 0-3,17")
         out.extend(range(int(first), int(last or first) + 1))
     return tuple(out)
 

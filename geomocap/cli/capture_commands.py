@@ -24,6 +24,7 @@ from geomocap.cli.progress_bars import progress_bars
 from geomocap.cli.reports import review_job, tell_results
 from geomocap.cli.settings_options import with_file_of_options, with_options_of
 from geomocap.config import Config
+from geomocap.settings import LEAST_FPS, MOST_FPS
 
 BUILT_IN: dict[str, Callable[[], AnimatedAsset]] = {"figure": figure, "mechanism": mechanism}
 DEMO = SynthesisSettings(cameras=8, width=320, height=240, fps=12, frames=24)
@@ -66,7 +67,9 @@ def import_(
     ],
     source: Annotated[Path, typer.Argument(metavar="SOURCE", help="The other tool's folder, or its calibration.")],
     capture: CaptureFolder,
-    fps: Annotated[float, typer.Option("--fps", min=0.001, help="Frames per second, where SOURCE doesn't say.")] = 30.0,
+    fps: Annotated[
+        float, typer.Option("--fps", min=LEAST_FPS, max=MOST_FPS, help="Frames per second, where SOURCE doesn't say.")
+    ] = 30.0,
     up: Annotated[
         Literal["y", "z"], typer.Option("--up", help="World axis that points up, where SOURCE doesn't say.")
     ] = "z",
@@ -117,6 +120,8 @@ def convert(
 ) -> None:
     """Convert a calibration between the formats of aniposelib, caliscope, Pose2Sim, OpenCV, EasyMocap and COLMAP."""
     rig = convert_calibration(source, target, kind, metres_per_unit=metres_per_unit)
+    for note in rig.notes:
+        console.print(f"note: {note}")
     console.print(f"{target}: {len(rig)} cameras")
 
 

@@ -12,7 +12,7 @@ from rich.table import Table
 from geomocap.cli.arguments import Workers
 from geomocap.cli.console import console
 from geomocap.cli.progress_bars import progress_bars
-from geomocap.cli.reports import capture_of
+from geomocap.cli.reports import capture_of, tell_faults
 from geomocap.cli.settings_options import with_options_of
 from geomocap.errors import RunError
 from geomocap.evaluation.evaluation_settings import EvaluationSettings
@@ -21,7 +21,8 @@ from geomocap.evaluation.result_check import check_run
 from geomocap.evaluation.run_evaluation import evaluate as evaluate_run
 from geomocap.files.atomic import write_text
 from geomocap.files.check_file import read_self_check
-from geomocap.files.results import read_warnings
+from geomocap.files.result_schemas import skeleton_gaps
+from geomocap.files.results import SKELETON, read_skeleton, read_warnings
 from geomocap.files.run import Run
 from viz.evaluation_report import evaluation_report
 
@@ -59,6 +60,7 @@ def evaluate(
 
     Example: `geomocap evaluate RUN walk.c3d --align true --find_offset true --report evaluation.html`
     """
+    tell_faults(Run(run))
     if truth is None:
         _without_truth(run, json_file)
         return
@@ -66,6 +68,8 @@ def evaluate(
         result = evaluate_run(run, truth, settings, matches=matches, unit=unit, up=up, progress=progress)
         if report is not None:
             evaluation_report(report, result, run, truth, progress=progress)
+    for gap in skeleton_gaps(read_skeleton(Run(run))) if Run(run).has(SKELETON) else ():
+        console.print(f"note: {gap}")
     for name, value in result.rounded().items():
         console.print(f"{name}: {value}", markup=False)
     _print_matches(result)

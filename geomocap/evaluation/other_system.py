@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from geomocap.export.c3d import read_c3d
 from geomocap.export.conventions import Axis, Convention, Unit
 from geomocap.export.markers import Markers
 from geomocap.export.trc import read_trc
+from geomocap.reading import read_toml
 
 OTHER_UNITS = 20.0  # times as large, or as small: the lengths are in other units
 
@@ -60,12 +60,7 @@ def read_matches(path: Path) -> dict[str, str]:
     EvaluationError
         If it can't be read or a marker stands twice.
     """
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise EvaluationError(f"{path}: can't be read ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise EvaluationError(f"{path}: not valid TOML ({error})") from None
+    table = read_toml(path, EvaluationError)
     for joint, marker in table.items():
         if not isinstance(marker, str):
             raise EvaluationError(f"{path}: {joint} = {marker!r}; expected the name of a marker in quotes")

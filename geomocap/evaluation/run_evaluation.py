@@ -59,6 +59,8 @@ def evaluate(
     if not run.is_dir():
         raise EvaluationError(f"{run}: no such run folder")
     if truth.is_dir() or truth.suffix.lower() == ".npz":
+        if matches is not None:
+            raise EvaluationError(f"{matches}: matches name another system's markers; {truth} is a synthetic truth")
         return evaluate_synthetic(Run(run), Truth.read(truth), settings, progress=progress)
     opened = Run(run)
     found = run_markers(opened, read_skeleton(opened), None, run_up(opened), ellipsoids=False)

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from geomocap.errors import RunError
+from geomocap.errors import GeometryError, RunError
 from geomocap.evaluation.result import EvaluationError
+from geomocap.files.array_schema import FPS, Expected, check_arrays
 from geomocap.files.npz import read_npz
 from geomocap.model.ray_casting import TriangleScene
 from geomocap.model.rotations import relative_turns, turn_angles
@@ -26,6 +27,18 @@ SHAPES = {
     "joint_parents": ("J",),
     "joint_positions": ("T", "J", 3),
     "joint_rotations": ("T", "J", 3, 3),
+}
+
+SCHEMA = {
+    "vertices": Expected("T V 3", low=-1e6, high=1e6),
+    "joint_positions": Expected("T J 3", low=-1e6, high=1e6),
+    "joint_rotations": Expected("T J 3 3", "rotation"),
+    "joint_names": Expected("J", "text"),
+    "joint_parents": Expected("J", "whole", low=-1, high="J"),
+    "faces": Expected("F 3", "whole", low=0, high="V"),
+    "vertex_joint": Expected("V", "whole", low=0, high="J"),
+    "vertex_weights": Expected("V J", low=0, high=1.01),
+    "fps": FPS,
 }
 
 
@@ -99,8 +112,9 @@ class Truth:
             raise EvaluationError(f"{file}: missing; a truth is a folder with truth.npz, or a motion file")
         try:
             arrays = read_npz(file)
-        except RunError:
-            raise EvaluationError(f"{file}: damaged; make it again") from None
+        except RunError as error:
+            why = str(error).removeprefix(f"{file}: ").partition(";")[0]
+            raise EvaluationError(f"{file}: {why}; make it again") from None
         _check(arrays, file)
         weights = arrays.get("vertex_weights")
         return cls(
@@ -207,6 +221,12 @@ def _largest_turn_deg(rotations: np.ndarray, reference: int, joint: int) -> floa
     return float(np.rad2deg(turn_angles(since_first)).max())
 
 
+def _numbers(values: np.ndarray, name: str, file: Path) -> np.ndarray:
+    if values.dtype.kind not in "fiu":
+        raise EvaluationError(f"{file}: {name} holds no numbers")
+    return values
+
+
 def _check(arrays: dict[str, np.ndarray], file: Path) -> None:
     missing = [k for k in ("fps", *SHAPES) if k not in arrays]
     if missing:
@@ -222,12 +242,13 @@ def _check(arrays: dict[str, np.ndarray], file: Path) -> None:
         if len(got) != len(shape) or 0 in got:
             raise EvaluationError(f"{file}: {name} has shape {got}, expected {' × '.join(map(str, shape))}, none empty")
     for name in ("vertices", "joint_positions", "joint_rotations"):
-        good = np.isfinite(arrays[name]).reshape(len(arrays[name]), -1).all(axis=1)
+        good = np.isfinite(_numbers(arrays[name], name, file)).reshape(len(arrays[name]), -1).all(axis=1)
         if not good.all():
             raise EvaluationError(f"{file}: {name} holds NaN or infinity in frame {int(np.argmin(good))}")
-    fps = float(arrays["fps"])
-    if not (np.isfinite(fps) and fps > 0):
-        raise EvaluationError(f"{file}: fps is {fps}; expected a positive number")
+    try:
+        check_arrays(arrays, SCHEMA)
+    except GeometryError as error:
+        raise EvaluationError(f"{file}: {error}; make it again") from None
     names = [str(n) for n in arrays["joint_names"]]
     if len(set(names)) < len(names):
         twice = next(n for n in names if names.count(n) > 1)

@@ -17,10 +17,12 @@ import numpy as np
 
 from geomocap.export.conventions import BVH, Axis, Convention
 from geomocap.export.export_errors import MotionError
+from geomocap.export.motion_text import LARGEST, ends_early, read_motion_text
 from geomocap.export.motion_tree import MotionTree
 from geomocap.files.atomic import write_text
 from geomocap.model.rotations import rotation_about, zxy_angles
 
+MOST_JOINTS = 10_000  # hands and faces included, subjects have a few hundred
 ROTATION_CHANNELS = ("Zrotation", "Xrotation", "Yrotation")
 POSITION_CHANNELS = ("Xposition", "Yposition", "Zposition")
 DECIMALS = 6
@@ -122,10 +124,9 @@ def read_bvh(path: Path, *, up: Axis = "y", unit: Literal["m", "cm", "mm"] = "m"
     MotionError
         If the file is no BVH, broken off, or holds something that is no number.
     """
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise MotionError(f"{path}: can't be read ({error.strerror})") from None
+    text = read_motion_text(path)
+    if ends_early(text):
+        raise MotionError(f"{path}: its last number is shorter than the others and has no line end; it was cut off")
     head, *rest = re.split(r"^\s*MOTION\s*$", text, maxsplit=1, flags=re.MULTILINE)
     if not head.lstrip().startswith("HIERARCHY") or not rest:
         raise MotionError(f"{path}: no BVH, it lacks HIERARCHY or MOTION; export it again")
@@ -161,6 +162,8 @@ def _parse_hierarchy(tokens: list[str], path: Path) -> _Parsed:
                 i += 1
             elif word == "OFFSET":
                 offset = [float(x) for x in tokens[i + 1 : i + 4]]
+                if len(offset) != 3 or not all(abs(x) < LARGEST for x in offset):
+                    raise MotionError(f"{path}: OFFSET {' '.join(tokens[i + 1 : i + 4])} is no place; export it again")
                 if end_site:
                     parsed.tips[stack[-1]] = offset
                 else:
@@ -176,6 +179,8 @@ def _parse_hierarchy(tokens: list[str], path: Path) -> _Parsed:
         raise MotionError(
             f"{path}: the HIERARCHY is damaged near {' '.join(tokens[i : i + 4])!r}; export it again"
         ) from None
+    if len(parsed.names) > MOST_JOINTS:
+        raise MotionError(f"{path}: {len(parsed.names):,} joints; expected {MOST_JOINTS} at the most")
     if len(stack) != 1 or not parsed.names:
         raise MotionError(f"{path}: the HIERARCHY's braces don't close, or it has no ROOT; export it again")
     known = {*ROTATION_CHANNELS, *POSITION_CHANNELS}

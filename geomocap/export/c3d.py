@@ -2,7 +2,7 @@
 
 Axes z up (POINT:X_SCREEN and Y_SCREEN say so), millimetres. Gaps are invalid points (residual -1), points that were
 filled in have residual 0. Bodies stand as 4×4 transforms in the ROTATION group, as Theia and Visual3D write them.
-Needs the package `ezc3d`.
+Writing needs the package `ezc3d`.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geomocap.export.c3d_file import read_c3d_file
 from geomocap.export.conventions import C3D, UNITS_PER_METRE, Axis
 from geomocap.export.export_errors import MotionError, require
 from geomocap.export.markers import Markers
@@ -19,6 +20,7 @@ from geomocap.files.atomic import write_atomic
 from geomocap.version import __version__
 
 FINEST_RESIDUAL = 0.01  # mm; residuals are bytes, multiples of POINT:SCALE
+_BLOCK = 512  # bytes
 LABELS_PER_PARAMETER = 255  # a dimension of a C3D parameter is a byte
 
 
@@ -65,7 +67,16 @@ def write_c3d(path: Path, markers: Markers, motion: MotionTree | None = None) ->
         file["data"]["rotations"] = _transforms(motion)
         _add_texts(file, "ROTATION", "LABELS", motion.names)
         file.add_parameter("ROTATION", "DESCRIPTIONS", ["world from body since the first frame, mm"] * motion.n_nodes)
-    write_atomic(path, lambda p: file.write(str(p)))
+    write_atomic(path, lambda p: file.write(str(p)), lambda p: _is_whole(p, markers, motion))
+
+
+def _is_whole(path: Path, markers: Markers, motion: MotionTree | None) -> bool:
+    """Whether a C3D holds its points and, from the next block on, its rotations; ezc3d tells of no full disk."""
+    data = path.read_bytes()
+    first = int.from_bytes(data[16:18], "little") - 1  # blocks before the points
+    points = 4 * 4 * len(markers.names) * markers.n_frames  # bytes
+    rotations = 0 if motion is None else 17 * 4 * motion.n_nodes * motion.n_frames
+    return first > 0 and len(data) >= _BLOCK * (first + -(-points // _BLOCK)) + rotations
 
 
 def _add_texts(file: dict, group: str, name: str, texts: tuple[str, ...]) -> None:
@@ -102,43 +113,20 @@ def read_c3d(path: Path, *, up: Axis | None = None) -> Markers:
 
     Raises
     ------
-    MissingPackageError
-        If ezc3d isn't installed.
     MotionError
-        If the file is no C3D, holds no points, names one twice, or says no usable rate or unit.
+        If the file is no C3D, ends too early, holds no points, names one twice, or says no usable rate or unit.
     """
-    ezc3d = require("ezc3d", extra="c3d", purpose="C3D files")
-    if not path.is_file():
-        raise MotionError(f"{path}: no such file")
-    if path.read_bytes()[1:2] != b"\x50":
-        raise MotionError(f"{path}: no C3D file, its second byte isn't 0x50")
-    try:
-        file = ezc3d.c3d(str(path))
-        point = file["parameters"]["POINT"]
-        values, residuals = file["data"]["points"], file["data"]["meta_points"]["residuals"][0]
-        fps = float(point["RATE"]["value"][0])
-        unit = (point["UNITS"]["value"] or [""])[0].strip().lower()
-    except Exception as error:
-        raise MotionError(f"{path}: no readable C3D file ({type(error).__name__}: {error}); export it again") from None
+    file = read_c3d_file(path)
+    unit = (file.texts("POINT:UNITS") or [""])[0].strip().lower()
     if unit not in UNITS_PER_METRE:
         raise MotionError(f"{path}: POINT:UNITS is {unit!r}; expected one of {', '.join(UNITS_PER_METRE)}")
-    names = [name.strip() for name in _texts(point, "LABELS")][: values.shape[1]]
-    positions = values[:3].transpose(2, 1, 0) / UNITS_PER_METRE[unit]
-    gaps = residuals.T < 0
-    positions = np.where(gaps[..., None], np.nan, positions)
-    known = np.where(gaps, np.nan, residuals.T / UNITS_PER_METRE[unit])
-    screen = (point["Y_SCREEN"]["value"] or [""])[0] if "Y_SCREEN" in point else ""
+    names = file.texts("POINT:LABELS")[: file.points.shape[1]]
+    gaps = (file.residuals < 0) | ~np.isfinite(file.points).all(axis=2)
+    positions = np.where(gaps[..., None], np.nan, file.points / UNITS_PER_METRE[unit])
+    known = np.where(gaps, np.nan, file.residuals / UNITS_PER_METRE[unit])
     axes: dict[str, Axis] = {"+X": "x", "+Y": "y", "+Z": "z"}
+    screen = (file.texts("POINT:Y_SCREEN") or [""])[0].strip().upper()
     try:
-        return Markers(tuple(names), positions, fps, up or axes.get(screen.strip().upper(), "z"), known)
+        return Markers(tuple(names), positions, file.rate, up or axes.get(screen, "z"), known)
     except MotionError as error:
         raise MotionError(f"{path}: {error}") from None
-
-
-def _texts(group: dict, name: str) -> list[str]:
-    texts = list(group[name]["value"])
-    for k in range(2, 100):
-        if f"{name}{k}" not in group:
-            break
-        texts += list(group[f"{name}{k}"]["value"])
-    return texts

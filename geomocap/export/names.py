@@ -10,7 +10,6 @@ knee_left = 4
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 
 from geomocap.export.export_errors import MotionError
 from geomocap.model.skeleton import body_names
+from geomocap.reading import check_name, read_toml
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ class Names:
     def __post_init__(self) -> None:
         for kind in (self.bodies, self.joints):
             for name in kind.values():
+                check_name(name, self.source, MotionError, "body or joint")
                 if not name or any(c.isspace() or c in "{}/\\" for c in name):
                     raise MotionError(
                         f"{self.source}: {name!r} is no usable name; leave out spaces, braces and slashes"
@@ -53,12 +54,10 @@ class Names:
         MotionError
             If the file can't be read, or a value isn't a body's number, or a number is named twice.
         """
-        try:
-            table = tomllib.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise MotionError(f"{path}: can't be read ({error.strerror})") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise MotionError(f"{path}: not valid TOML ({error})") from None
+        table = read_toml(path, MotionError)
+        for key in ("joints", "bodies"):
+            if not isinstance(table.get(key, {}), dict):
+                raise MotionError(f"{path}: {key} is no table; write [{key}], then lines such as thigh_left = 3")
         joints = table.pop("joints", {})
         bodies = {**table.pop("bodies", {}), **table}
         return cls(_by_number(bodies, path, "body"), _by_number(joints, path, "joint"), str(path))

@@ -13,6 +13,7 @@ import numpy as np
 from geomocap.export.conventions import TRC, UNITS_PER_METRE, Axis, Convention
 from geomocap.export.export_errors import MotionError
 from geomocap.export.markers import Markers
+from geomocap.export.motion_text import ends_early, read_motion_text
 from geomocap.files.atomic import write_text
 
 DECIMALS = {"mm": 4, "m": 7}
@@ -68,10 +69,8 @@ def read_trc(path: Path, *, up: Axis = "y") -> Markers:
     MotionError
         If the file is no TRC, broken off, names a marker twice or an unknown unit, or its rate contradicts its times.
     """
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise MotionError(f"{path}: can't be read ({error.strerror})") from None
+    text = read_motion_text(path)
+    lines = text.splitlines()
     if len(lines) < 6 or not lines[0].startswith("PathFileType"):
         raise MotionError(f"{path}: no TRC, it doesn't begin with PathFileType and five header lines")
     header = dict(zip(lines[1].split("\t"), lines[2].split("\t"), strict=False))
@@ -88,6 +87,8 @@ def read_trc(path: Path, *, up: Axis = "y") -> Markers:
         raise MotionError(
             f"{path}: the header says {n_frames} frames, the file holds {len(body)}; it was cut off or edited"
         )
+    if ends_early(text) or (text[-1] not in "\r\n" and body[-1].count("\t") < max(row.count("\t") for row in body)):
+        raise MotionError(f"{path}: its last row is shorter than the others and has no line end; it was cut off")
     times, positions = _rows(body, len(names), path)
     if not (np.isfinite(fps) and fps > 0):
         raise MotionError(f"{path}: DataRate is {fps}; expected a positive number of frames per second")

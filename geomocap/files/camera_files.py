@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 
 import numpy as np
 
@@ -13,8 +12,10 @@ from geomocap.files.capture import Capture
 from geomocap.files.rigs import read_rig, write_rig
 from geomocap.files.run import Run
 from geomocap.model.camera_correction import CameraCorrection
+from geomocap.reading import read_json, reason
 
 CAMERAS, SPARSE = "cameras.json", "sparse"
+SPARSE_FILES = tuple(f"{SPARSE}/{part}.txt" for part in ("cameras", "images", "points3D", "rigs", "frames"))
 
 
 def write_cameras(run: Run, found: CameraCorrection) -> None:
@@ -26,11 +27,7 @@ def write_cameras(run: Run, found: CameraCorrection) -> None:
     content: dict[str, object] = {"disagreement_px": known(found.before), "left_px": known(found.after)}
     content["corrected"] = found.is_corrected
     if found.is_corrected:
-        passing = run.path / f".{SPARSE}"
-        shutil.rmtree(passing, ignore_errors=True)
-        write_rig(passing, found.rig)
-        shutil.rmtree(run.path / SPARSE, ignore_errors=True)
-        passing.rename(run.path / SPARSE)
+        write_rig(run.path / SPARSE, found.rig)
         moved = 1000 * np.linalg.norm(found.rig.centers - found.given.centers, axis=1)
         content["moved_mm"] = {name: round(float(mm), 1) for name, mm in zip(found.rig.names, moved, strict=True)}
     write_text(run.path / CAMERAS, json.dumps(content, indent=1))
@@ -39,7 +36,7 @@ def write_cameras(run: Run, found: CameraCorrection) -> None:
 def as_seen(run: Run, capture: Capture) -> Capture:
     """Return the capture with the cameras that a run uses: its own if the calibration was corrected."""
     folder = run.path / SPARSE
-    if not folder.is_dir() or not capture.is_calibrated:
+    if not run.has(SPARSE_FILES[0]) or not capture.is_calibrated:
         return capture
     return capture.with_rig(read_rig(folder, capture.cameras))
 
@@ -55,13 +52,13 @@ def camera_warnings(run: Run) -> list[str]:
     file = run.path / CAMERAS
     if not file.is_file():
         return []
+    found = read_json(file, RunError)
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
         if not found["corrected"]:
             return []
         before, after = float(found["disagreement_px"]), float(found["left_px"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise RunError(f"{file}: damaged ({error}); delete it and run again") from None
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        raise RunError(f"{file}: damaged ({reason(error)}); delete it and run again") from None
     return [
         f"The calibration contradicts the silhouettes by {before:.1f} pixels; cameras corrected by them "
         f"({after:.1f} pixels) were used, {SPARSE}/ of the run. Calibrate again where you can."

@@ -12,7 +12,6 @@ bar/<camera>/000000.png          optional reference-bar recording
 from __future__ import annotations
 
 import os
-import tomllib
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -28,7 +27,8 @@ from geomocap.files.images import IMAGE_ENDINGS, ImageFolder, read_image, size_t
 from geomocap.files.rigs import read_rig
 from geomocap.files.videos import VIDEO_ENDINGS, Video
 from geomocap.model.rig import Rig
-from geomocap.settings import Settings
+from geomocap.reading import check_name, list_folder, read_toml
+from geomocap.settings import LEAST_FPS, MOST_FPS, Settings, explained
 
 PARTS = ("capture.toml", "images", "videos", "background", "masks", "sparse", "bar", "reference")
 
@@ -39,10 +39,12 @@ class CaptureInfo(Settings):
     """What `capture.toml` says."""
 
     name: str = Field("capture", description="name of the recording")
-    fps: float = Field(gt=0, description="frames per second")
+    fps: float = Field(ge=LEAST_FPS, le=MOST_FPS, description="frames per second")
     length_unit: Literal["m"] = Field("m", description="unit of the calibration")
     up: Literal["y", "z"] = Field("z", description="world axis that points up")
-    cameras: tuple[str, ...] | None = Field(None, description="the cameras to use, in this order; all if not given")
+    cameras: tuple[str, ...] | None = Field(
+        None, min_length=1, description="the cameras to use, in this order; all if not given"
+    )
     frames: tuple[int, int] | None = Field(
         None, description="the first and the last frame to use, of what was recorded; all if not given"
     )
@@ -270,6 +272,8 @@ class Capture:
             return self.corrected
         if not self.is_calibrated:
             raise CaptureError(f"{self.path}: not calibrated, no folder sparse/; run `geomocap calibrate {self.path}`")
+        if len(self.cameras) < 2:
+            raise CaptureError(f"{self.path}: one camera, {self.cameras[0]}, can't measure depth; take two or more")
         rig = read_rig(self.path / "sparse", self.cameras)
         for name, (w, h) in zip(rig.names, rig.sizes, strict=True):
             size = self.sources[name].size
@@ -318,18 +322,9 @@ def read_capture_info(path: Path) -> CaptureInfo:
     """Read and check `capture.toml` of a capture folder."""
     file = path / "capture.toml"
     try:
-        return CaptureInfo(**tomllib.loads(file.read_text(encoding="utf-8")))
-    except OSError as error:
-        raise CaptureError(
-            f"{file}: can't be read ({error.strerror}); a capture needs at least `fps = …` in it"
-        ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CaptureError(f"{file}: not valid TOML ({error})") from None
+        return CaptureInfo(**read_toml(file, CaptureError, "a capture needs at least `fps = …` in it"))
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(p) for p in first["loc"])
-        message = first["msg"].removeprefix("Value error, ")
-        raise CaptureError(f"{file}: {key}: {message}; see README, section Captures") from None
+        raise CaptureError(f"{file}: {explained(error)}; see README, section Captures") from None
 
 
 def write_capture_info(path: Path, info: CaptureInfo) -> None:
@@ -337,19 +332,25 @@ def write_capture_info(path: Path, info: CaptureInfo) -> None:
     write_text(path / "capture.toml", tomli_w.dumps(info.model_dump(exclude_none=True)))
 
 
+def _entries(folder: Path) -> list[Path]:
+    return list_folder(folder, CaptureError) if folder.is_dir() else []
+
+
 def _find_sources(path: Path) -> dict[str, FrameSource]:
     """Frames by camera: images, videos, or if there are neither, the given silhouettes."""
     sources = _image_folders(path / "images")
-    for file in sorted((path / "videos").glob("*")):
+    for file in _entries(path / "videos"):
         if file.suffix.lower() in VIDEO_ENDINGS and file.stem not in sources:
+            check_name(file.stem, str(path / "videos"), CaptureError)
             sources[file.stem] = Video(file)
     return sources or _image_folders(path / "masks")
 
 
 def _image_folders(parent: Path) -> dict[str, FrameSource]:
     sources: dict[str, FrameSource] = {}
-    for folder in sorted(p for p in parent.glob("*") if p.is_dir()):
-        files = tuple(sorted(f for f in folder.iterdir() if f.suffix.lower() in IMAGE_ENDINGS))
+    for folder in (p for p in _entries(parent) if p.is_dir()):
+        check_name(folder.name, str(parent), CaptureError)
+        files = tuple(f for f in list_folder(folder, CaptureError) if f.suffix.lower() in IMAGE_ENDINGS)
         for k, file in enumerate(files):
             if file.stem != f"{k:06d}":
                 raise CaptureError(f"{file}: expected frame {k:06d} here; frames count from 000000 without gaps")

@@ -10,6 +10,7 @@ from geomocap.errors import RunError
 from geomocap.files.atomic import write_text
 from geomocap.files.run import Run
 from geomocap.model.self_check import SelfCheck
+from geomocap.reading import read_json, reason
 
 CHECK = "check.json"
 
@@ -41,13 +42,13 @@ def read_self_check(run: Run) -> SelfCheck | None:
     file = run.path / CHECK
     if not file.is_file():
         return None
+    found = read_json(file, RunError)
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
         model, left_out = (np.array(found[name], float) for name in ("model", "left_out"))
         residual = float("nan") if found["residual"] is None else float(found["residual"])
         cameras, frames = tuple(str(c) for c in found["cameras"]), np.array(found["frames"], int)
         if model.shape != left_out.shape or model.shape != (len(cameras), len(frames)):
             raise ValueError("its tables have different sizes")
         return SelfCheck(cameras, frames, model, left_out, residual)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise RunError(f"{file}: damaged ({error}); delete it and run again") from None
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        raise RunError(f"{file}: damaged ({reason(error)}); delete it and run again") from None

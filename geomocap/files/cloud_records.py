@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from geomocap.errors import RunError
 from geomocap.files.atomic import write_text
 from geomocap.files.run import Run
+from geomocap.reading import read_json
 
 
 @dataclass(frozen=True)
@@ -47,13 +48,13 @@ def read_cloud_record(run: Run) -> CloudRecord | None:
     files = sorted((run.path / "cloud").glob("[0-9]*.json"))
     points = 0
     for file in files:
+        record = read_json(file, RunError)
         try:
-            record = json.loads(file.read_text(encoding="utf-8"))
             points += int(record["points"])
             reasons.update({str(k): int(v) for k, v in record["reasons"].items()})
             for warning in record["warnings"]:
                 warnings[first.setdefault(re.sub(r"[\d.]+ ?(px|%)", "", warning), warning)] += 1
-        except (OSError, ValueError, KeyError, AttributeError, TypeError):
+        except (ValueError, KeyError, AttributeError, TypeError, OverflowError):
             raise RunError(f"{file}: damaged; delete it and run again") from None
     return CloudRecord(len(files), points, dict(reasons), dict(warnings)) if files else None
 
@@ -61,4 +62,4 @@ def read_cloud_record(run: Run) -> CloudRecord | None:
 def write_cloud_record(run: Run, frame: int, points: int, reasons: Mapping[str, int], warnings: Sequence[str]) -> None:
     """Write of a frame how many points were measured, why others were not, and what looks wrong."""
     record = {"points": points, "reasons": dict(reasons), "warnings": list(warnings)}
-    write_text(run.path / "cloud" / f"{frame:06d}.json", json.dumps(record, indent=1))
+    write_text(run.path / "cloud" / f"{frame:06d}.json", json.dumps(record, indent=1), lasting=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +10,22 @@ import open3d as o3d
 
 from geomocap.errors import GeometryError
 from geomocap.files.atomic import write_atomic
-from geomocap.files.open3d_geometry import read_by_open3d
+from geomocap.files.geometry_claims import check_geometry
+from geomocap.files.open3d_geometry import check_ply, read_by_open3d, write_by_open3d
+from geomocap.files.whole_files import is_whole_ply
 from geomocap.model.frame_geometry import BodyPoints, Voxels
+from geomocap.reading import open_plain, read_bytes
 
 
 def write_voxels(path: Path, voxels: Voxels) -> None:
     """Write voxels as the PLY of an Open3D voxel grid, whole or not at all."""
     grid = voxels.to_open3d()
-    write_atomic(path, lambda p: o3d.io.write_voxel_grid(p, grid))
+    write_atomic(
+        path,
+        write_by_open3d(o3d.io.write_voxel_grid, grid, _VOXEL.itemsize * len(voxels.indices)),
+        is_whole_ply,
+        lasting=False,
+    )
 
 
 def read_voxels(path: Path) -> Voxels:
@@ -29,11 +38,13 @@ def read_voxels(path: Path) -> Voxels:
     """
     if not path.is_file():
         raise GeometryError(f"{path}: no such voxel grid")
+    check_ply(path)
     voxels = _read_binary(path)
     if voxels is not None:
         return Voxels.sorted(*voxels)
     grid = read_by_open3d(o3d.io.read_voxel_grid, path)
-    if not grid.has_voxels():
+    size_is_known = bool(np.isfinite(grid.voxel_size) and grid.voxel_size > 0 and np.isfinite(grid.origin).all())
+    if not grid.has_voxels() or not size_is_known:
         raise GeometryError(f"{path}: no readable voxel grid; make it again")
     return Voxels.from_open3d(grid)
 
@@ -41,7 +52,8 @@ def read_voxels(path: Path) -> Voxels:
 def write_points(path: Path, points: BodyPoints | o3d.t.geometry.PointCloud) -> None:
     """Write points with their bodies, or any tensor point cloud, as PLY, whole or not at all."""
     cloud = points.to_open3d() if isinstance(points, BodyPoints) else points
-    write_atomic(path, lambda p: o3d.t.io.write_point_cloud(p, cloud))
+    size = sum(tensor.numpy().nbytes for _, tensor in cloud.point.items())
+    write_atomic(path, write_by_open3d(o3d.t.io.write_point_cloud, cloud, size), is_whole_ply, lasting=False)
 
 
 def read_points(path: Path) -> BodyPoints:
@@ -54,6 +66,7 @@ def read_points(path: Path) -> BodyPoints:
     """
     if not path.is_file():
         raise GeometryError(f"{path}: no such point cloud")
+    check_geometry(path)
     cloud = read_by_open3d(o3d.t.io.read_point_cloud, path)
     if "positions" not in cloud.point or not len(cloud.point.positions):
         raise GeometryError(f"{path}: no readable points; delete it and run again")
@@ -71,11 +84,9 @@ def read_points(path: Path) -> BodyPoints:
 
 def ply_count(path: Path) -> int:
     """Return the number of vertices that a PLY file announces, without reading them; 0 if it announces none."""
-    with path.open("rb") as file:
-        for line in file.read(4096).splitlines():
-            if line.startswith(b"element vertex"):
-                return int(line.split()[2])
-    return 0
+    with open_plain(path) as file:
+        match = re.search(rb"^element vertex (\d{1,15})\s*$", file.read(4096), re.MULTILINE)
+    return int(match[1]) if match else 0
 
 
 _HEADER = b"""ply
@@ -92,7 +103,7 @@ _VOXEL = np.dtype([("index", "<f8", 3), ("color", "u1", 3)])
 
 def _read_binary(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
     """Read a voxel grid as Open3D writes it, a hundred times faster than voxel by voxel; None if it is another kind."""
-    data = path.read_bytes()
+    data = read_bytes(path)
     head, _, body = data.partition(b"end_header\n")
     lines = head.decode("ascii", "replace").splitlines()
     vertex = [line for line in lines if line.startswith("element vertex ")]
@@ -111,4 +122,7 @@ def _read_binary(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]
     if len(body) != 13 * 8 + count * _VOXEL.itemsize or not np.array_equal(frame[3:12].reshape(3, 3), np.eye(3)):
         return None
     voxels = np.frombuffer(body, _VOXEL, count, 13 * 8)
+    index, place = voxels["index"], frame[[0, 1, 2, 12]]
+    if not (np.isfinite(place).all() and place[3] > 0 and (np.abs(index) < 1 << 30).all()):
+        raise GeometryError(f"{path}: its voxels are at no places that can be; make it again")
     return voxels["index"].astype(np.int32), np.array(voxels["color"]), np.array(frame[:3]), float(frame[12])

@@ -9,12 +9,14 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import open3d as o3d
 
 from geomocap.errors import GeometryError
+from geomocap.files.atomic import make_room
+from geomocap.reading import open_plain
 
 T = TypeVar("T")
 
@@ -25,11 +27,12 @@ _BYTES = {
     **dict.fromkeys(("double", "float64"), 8),
 }
 _HEADER_LIMIT = 1 << 16  # bytes
+_PLY_HEADER = 512  # bytes, about
 _alone = threading.Lock()  # the verbosity is one for all threads
 
 
 def read_by_open3d(read: Callable[[Path], T], path: Path) -> T:
-    """Read a geometry file by one of Open3D's functions.
+    """Read a geometry file by one of Open3D's functions, which believe whatever it claims.
 
     Raises
     ------
@@ -40,6 +43,20 @@ def read_by_open3d(read: Callable[[Path], T], path: Path) -> T:
         check_ply(path)
     with _alone, o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         return read(path)
+
+
+def write_by_open3d(write: Callable[[Path, Any], bool], geometry: Any, size: int) -> Callable[[Path], bool]:
+    """Return what writes a geometry by one of Open3D's functions, which is silent then.
+
+    Where there is no room for `size` bytes it isn't called: it would go on, and its PLY library talk.
+    """
+
+    def silently(path: Path) -> bool:
+        make_room(path, size + _PLY_HEADER)
+        with _alone, o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            return write(path, geometry)
+
+    return silently
 
 
 @dataclass
@@ -59,7 +76,7 @@ def check_ply(path: Path) -> None:
     GeometryError
     """
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             head, end, _ = file.read(_HEADER_LIMIT).partition(b"end_header")
             file.seek(len(head) + len(end))
             kind, elements = _header(head if end else b"")
@@ -71,7 +88,7 @@ def check_ply(path: Path) -> None:
                 missing = _missing(file.read(), elements, "little" if "little" in kind else "big")
     except OSError as error:
         raise GeometryError(f"{path}: can't be read ({error.strerror})") from None
-    except (ValueError, KeyError, IndexError):
+    except (ValueError, KeyError, IndexError, OverflowError):
         raise GeometryError(f"{path}: no PLY file, its header can't be read; make it again") from None
     if missing > 0:
         what = "lines" if kind == "ascii" else "bytes"
@@ -86,9 +103,13 @@ def _header(head: bytes) -> tuple[str, list[_Element]]:
             kind = rest[0]
         elif word == "element":
             elements.append(_Element(rest[0], int(rest[1])))
+            if elements[-1].count < 0:
+                raise ValueError
         elif word == "property":
             types = rest[1:3] if rest[0] == "list" else rest[:1]
             elements[-1].properties.append(tuple(_BYTES[t] for t in types))
+    if any(e.count and not e.properties for e in elements):
+        raise ValueError
     if first.strip() != "ply" or kind not in ("ascii", "binary_little_endian", "binary_big_endian"):
         raise ValueError
     return kind, elements

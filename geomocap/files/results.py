@@ -17,11 +17,13 @@ from typing import Any
 import numpy as np
 
 from geomocap.errors import GeometryError, RunError
+from geomocap.files.array_schema import Expected, check_arrays
 from geomocap.files.atomic import write_text
 from geomocap.files.cloud_records import CloudRecord, read_cloud_record, write_cloud_record
 from geomocap.files.frame_files import ply_count, read_points, read_voxels, write_points, write_voxels
 from geomocap.files.images import read_image
 from geomocap.files.npz import read_npz, write_npz
+from geomocap.files.result_schemas import DIAGNOSTICS_SCHEMA, ELLIPSOIDS_SCHEMA, KEYPOINTS_SCHEMA, SKELETON_SCHEMA
 from geomocap.files.run import Run
 from geomocap.files.tracks_file import TRACKS, read_tracks, read_trajectories, write_tracks
 from geomocap.model.diagnostics import Diagnostics
@@ -30,6 +32,7 @@ from geomocap.model.hierarchy import parents_first
 from geomocap.model.keypoint_paths import KeyPointPaths, KeyPoints
 from geomocap.model.skeleton import Skeleton, body_names, joint_names
 from geomocap.model.trajectories import Trajectories
+from geomocap.reading import read_json, reason
 
 ELLIPSOIDS, SKELETON, KEYPOINTS = "ellipsoids.npz", "skeleton.npz", "keypoints.npz"
 DIAGNOSTICS, WARNINGS = "diagnostics.npz", "diagnostics.json"
@@ -72,8 +75,8 @@ def _named(file: Path) -> Iterator[None]:
     """Say of what can't be understood which file it is in."""
     try:
         yield
-    except (GeometryError, ValueError, TypeError, IndexError) as error:
-        raise RunError(f"{file}: {error}; delete it and run again") from None
+    except (GeometryError, ValueError, TypeError, IndexError, KeyError, OverflowError) as error:
+        raise RunError(f"{file}: {reason(error)}; delete it and run again") from None
 
 
 # --- ellipsoids ---
@@ -97,6 +100,7 @@ def read_ellipsoids(run: Run) -> Ellipsoids:
     file = run.path / ELLIPSOIDS
     found = read_npz(file, needed=("centers", "radii", "rotations"))
     with _named(file):
+        check_arrays(found, ELLIPSOIDS_SCHEMA)
         count = found["centers"].shape[:-1]
         return Ellipsoids(
             found["centers"],
@@ -130,10 +134,12 @@ def read_skeleton(run: Run) -> Skeleton:
     needed = ("joint_positions", "joint_bodies", "body_rotations", "body_positions", "fps")
     found = read_npz(file, needed=needed)
     with _named(file):
+        check_arrays(found, {"joint_bodies": Expected("J 2", "whole")} if found["joint_bodies"].size else {})
         pairs = found["joint_bodies"].astype(np.int32).reshape(-1, 2)
         joints, places = len(pairs), found["joint_positions"].astype(float)
         if not joints:
             places = np.zeros((len(found["body_positions"]), 0, 3))
+        check_arrays({**found, "joint_positions": places, "joint_bodies": pairs}, SKELETON_SCHEMA)
         if places.ndim != 3 or places.shape[1] != joints or found["body_positions"].ndim != 3:
             raise GeometryError(f"joint_positions has shape {places.shape}, expected (T, {joints}, 3)")
         count = found["body_positions"].shape[1]
@@ -188,6 +194,7 @@ def read_keypoint_paths(run: Run) -> KeyPoints:
     file = run.path / KEYPOINTS
     found = read_npz(file, needed=("names", "positions", "radius"))
     with _named(file):
+        check_arrays(found, KEYPOINTS_SCHEMA)
         positions, count = found["positions"], found["positions"].shape[:2]
         paths = KeyPointPaths(
             positions,
@@ -229,6 +236,7 @@ def read_diagnostics(run: Run) -> Diagnostics:
     names = [f.name for f in fields(Diagnostics)]
     found = read_npz(file, only=names)
     with _named(file):
+        check_arrays(found, DIAGNOSTICS_SCHEMA)
         values: dict[str, Any] = dict(found)
         for name, kind in (("paths", str), ("first_frame", int), ("threshold", float)):
             if name in values:
@@ -250,12 +258,13 @@ def read_warnings(run: Run) -> list[str]:
         If the file is damaged.
     """
     file = run.path / WARNINGS
-    try:
-        return [str(w) for w in json.loads(file.read_text(encoding="utf-8")).get("warnings", [])]
-    except FileNotFoundError:
+    if not file.is_file():
         return []
-    except (OSError, ValueError, AttributeError) as error:
-        raise RunError(f"{file}: damaged ({error}); delete it and run again") from None
+    found = read_json(file, RunError)
+    warnings = found.get("warnings", []) if isinstance(found, dict) else None
+    if not isinstance(warnings, list):
+        raise RunError(f"{file}: damaged (no list of warnings); delete it and run again")
+    return [str(w) for w in warnings]
 
 
 # --- whatever was followed ---

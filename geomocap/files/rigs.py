@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from geomocap.errors import CalibrationError
+from geomocap.files.atomic import write_folder
+from geomocap.files.colmap_model import read_colmap_model
+from geomocap.model.orientations import NOTED
 from geomocap.model.rig import Rig
+from geomocap.reading import check_name
+
+MODEL_FILES = frozenset(
+    f"{name}.{ending}" for name in ("cameras", "frames", "images", "points3D", "rigs") for ending in ("bin", "txt")
+)
 
 
 def read_rig(sparse: Path, names: Sequence[str] | None = None) -> Rig:
@@ -27,33 +35,31 @@ def read_rig(sparse: Path, names: Sequence[str] | None = None) -> Rig:
     CalibrationError
         If the folder holds no model, or a camera has no posed image, or two images disagree about its pose.
     """
-    try:
-        model = pycolmap.Reconstruction(str(sparse))
-    except Exception as error:
-        raise CalibrationError(f"{sparse}: no readable COLMAP model ({_first_line(error)})") from None
+    model = read_colmap_model(sparse)
     found: dict[str, tuple[pycolmap.Camera, np.ndarray]] = {}
-    for image in sorted(model.images.values(), key=lambda i: i.name):
-        if not image.has_pose:
-            continue
+    notes: dict[str, str] = {}
+    for image in sorted(model.images, key=lambda i: i.name):
         name = image.name.split("/")[0] if "/" in image.name else Path(image.name).stem
-        pose = image.cam_from_world().matrix()
+        check_name(name, str(sparse), CalibrationError)
+        pose = image.pose
+        if image.camera not in model.cameras:
+            raise CalibrationError(f"{sparse}: image {image.name} is of camera {image.camera}, which isn't there")
         if name in found and not np.allclose(found[name][1], pose, atol=1e-9):
             raise CalibrationError(
                 f"{sparse}: images of camera {name} have different poses, but cameras must not move; "
                 f"keep one image {name}/<anything>"
             )
-        found.setdefault(name, (model.cameras[image.camera_id], pose))
+        if image.off > NOTED:
+            notes[name] = f"camera {name}: its quaternion is of unit length to {image.off:.1g} only; it is taken as one"
+        found.setdefault(name, (model.cameras[image.camera], pose))
     wanted = tuple(sorted(found)) if names is None else tuple(names)
     for name in wanted:
         if name not in found:
             raise CalibrationError(
                 f"{sparse}: no posed image of camera {name}; the model has {', '.join(sorted(found)) or 'none'}"
             )
-    return Rig(
-        wanted,
-        tuple(found[n][0] for n in wanted),
-        np.array([found[n][1] for n in wanted]).reshape(-1, 3, 4),
-    )
+    cameras, poses = [found[n][0] for n in wanted], [found[n][1] for n in wanted]
+    return Rig.of_file(str(sparse), wanted, cameras, np.array(poses).reshape(-1, 3, 4), notes.values())
 
 
 def colmap_model(rig: Rig) -> pycolmap.Reconstruction:
@@ -69,10 +75,47 @@ def colmap_model(rig: Rig) -> pycolmap.Reconstruction:
     return model
 
 
-def write_rig(sparse: Path, rig: Rig) -> None:
-    """Write a rig as a COLMAP text model into the folder `sparse`, which is made if need be."""
-    sparse.mkdir(parents=True, exist_ok=True)
-    colmap_model(rig).write_text(str(sparse))
+def write_rig(sparse: Path, rig: Rig, *, binary: bool = False) -> None:
+    """Write a rig as a COLMAP model into the folder `sparse`, made if need be; see `write_model`."""
+    write_model(sparse, colmap_model(rig), binary=binary)
+
+
+def write_model(
+    sparse: Path, model: pycolmap.Reconstruction, *, binary: bool = False, beside: Mapping[str, str] | None = None
+) -> None:
+    """Put a COLMAP model in the place of the one in a folder, whole or not at all; other files there stay.
+
+    Parameters
+    ----------
+    sparse : Path
+    model : pycolmap.Reconstruction
+    binary : bool
+    beside : mapping of str to str, optional
+        Further files, name and text.
+
+    Raises
+    ------
+    RunError
+        If the folder can't be written.
+    """
+    texts = beside or {}
+
+    def write(folder: Path) -> None:
+        (model.write_binary if binary else model.write_text)(str(folder))
+        for name, text in texts.items():
+            (folder / name).write_text(text, encoding="utf-8")
+
+    def whole(folder: Path) -> bool:
+        if not binary and not all(f.read_bytes().endswith(b"\n") for f in folder.glob("*.txt")):
+            return False
+        try:
+            back = pycolmap.Reconstruction(str(folder))
+        except Exception:
+            return False
+        counts = [(m.num_cameras(), m.num_images(), m.num_points3D()) for m in (model, back)]
+        return counts[0] == counts[1]
+
+    write_folder(sparse, write, whole, MODEL_FILES)
 
 
 def _first_line(error: BaseException) -> str:

@@ -11,8 +11,11 @@ import trimesh
 
 from geomocap.errors import GeometryError
 from geomocap.files.frame_files import read_voxels
-from geomocap.files.open3d_geometry import check_ply, read_by_open3d
+from geomocap.files.geometry_claims import check_faces, check_geometry
+from geomocap.files.npz import array_names, read_arrays
+from geomocap.files.open3d_geometry import read_by_open3d
 from geomocap.files.ragged_arrays import spread_over_frames
+from geomocap.reading import open_plain, reason, shortened
 
 MESH_ENDINGS = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 CLOUD_ENDINGS = (".ply", ".pcd", ".xyz", ".pts")
@@ -95,21 +98,44 @@ def read_surface(path: Path) -> ScanSurface:
     suffix = path.suffix.lower()
     if suffix in ARRAY_ENDINGS:
         return ScanSurface(read_array(path))
-    if suffix == ".ply":
-        check_ply(path)
-        if _is_voxel_grid(path):
-            return ScanSurface(read_voxels(path).points)
+    check_geometry(path)
+    if suffix == ".ply" and _is_voxel_grid(path):
+        return ScanSurface(read_voxels(path).points)
     try:
-        if suffix in MESH_ENDINGS:
-            mesh = trimesh.load(path, process=False, force="mesh")
-            if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-                return ScanSurface(np.asarray(mesh.vertices, float), np.asarray(mesh.faces))
+        mesh = read_mesh(path) if suffix in MESH_ENDINGS else None
+        if mesh is not None:
+            return ScanSurface(np.asarray(mesh.vertices, float), np.asarray(mesh.faces))
         cloud = read_by_open3d(o3d.io.read_point_cloud, path) if suffix in CLOUD_ENDINGS else None
+    except GeometryError:
+        raise
     except Exception as error:
-        raise GeometryError(f"{path}: can't be read as a scan ({str(error).splitlines()[0]})") from None
+        raise GeometryError(f"{path}: can't be read as a scan ({reason(error)})") from None
     if cloud is None or not cloud.has_points():
         raise GeometryError(f"{path}: holds neither triangles nor points; is it whole?")
     return ScanSurface(np.asarray(cloud.points))
+
+
+def read_mesh(path: Path) -> trimesh.Trimesh | None:
+    """Read the triangles of a file; None if it has none.
+
+    Raises
+    ------
+    GeometryError
+        If the file claims more than it holds, can't be read, or has triangles of vertices that aren't there.
+    """
+    check_geometry(path)
+    try:
+        mesh = trimesh.load(path, process=False, force="mesh")
+        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+            return None
+        if np.shape(mesh.vertices)[1:] != (3,) or np.shape(mesh.faces)[1:] != (3,):
+            raise GeometryError(f"{path}: its vertices have {np.shape(mesh.vertices)[1:]} coordinates; make it again")
+        check_faces(mesh.faces, len(mesh.vertices), path)
+        return mesh
+    except GeometryError:
+        raise
+    except Exception as error:
+        raise GeometryError(f"{path}: can't be read as a scan ({reason(error)})") from None
 
 
 def holds_tracks(path: Path) -> bool:
@@ -117,9 +143,8 @@ def holds_tracks(path: Path) -> bool:
     if path.suffix.lower() != ".npz":
         return False
     try:
-        with np.load(path, allow_pickle=False) as data:
-            return set(data.files) >= _TRACKS
-    except (OSError, ValueError, EOFError):
+        return set(array_names(path)) >= _TRACKS
+    except (OSError, ValueError):
         return False  # what is wrong with it, reading it says
 
 
@@ -129,25 +154,19 @@ def read_array(path: Path) -> np.ndarray:
     Of tracks, whose first axis is that of the points, the axes are exchanged.
     """
     try:
-        data = np.load(path, allow_pickle=False)
-        if isinstance(data, np.ndarray):
-            array = data
-        else:
-            with data:
-                name = next((n for n in ("points", "positions", "vertices") if n in data.files), None)
-                if name is None:
-                    raise GeometryError(
-                        f"{path}: expected an array `points` of shape (N, 3) or (T, N, 3); "
-                        f"it has {', '.join(data.files)}"
-                    )
-                array = data[name]
-                if _TRACKS <= set(data.files):
-                    if str(data["layout"] if "layout" in data.files else "") == "ragged":
-                        array = spread_over_frames(array, data["first"], data["start"], int(data["n_frames"]))
-                    if array.ndim == 3:
-                        array = array.swapaxes(0, 1)
-    except (OSError, ValueError, KeyError, IndexError, EOFError) as error:
-        raise GeometryError(f"{path}: can't be read as plain arrays ({error})") from None
+        found = read_arrays(path)
+        name = next((n for n in ("", "points", "positions", "vertices") if n in found), None)
+        if name is None:
+            has = shortened(", ".join(found)) or "none"
+            raise GeometryError(f"{path}: expected an array `points` of shape (N, 3) or (T, N, 3); it has {has}")
+        array = found[name]
+        if found.keys() >= _TRACKS:
+            if str(found.get("layout", "")) == "ragged":
+                array = spread_over_frames(array, found["first"], found["start"], int(found["n_frames"]))
+            if array.ndim == 3:
+                array = array.swapaxes(0, 1)
+    except (OSError, ValueError, KeyError, IndexError, TypeError, OverflowError, MemoryError) as error:
+        raise GeometryError(f"{path}: can't be read as plain arrays ({reason(error)})") from None
     if array.ndim not in (2, 3) or array.shape[-1] != 3 or array.dtype.kind not in "fiu":
         raise GeometryError(
             f"{path}: expected numbers of shape (N, 3) or (T, N, 3), got {array.dtype} of shape {array.shape}"
@@ -156,6 +175,6 @@ def read_array(path: Path) -> np.ndarray:
 
 
 def _is_voxel_grid(path: Path) -> bool:
-    with path.open("rb") as file:
+    with open_plain(path) as file:
         header = file.read(2048)
     return b"element origin" in header or b"voxel_size" in header

@@ -15,6 +15,7 @@ class ScanSettings(Settings):
     samples: int = Field(
         20000,
         ge=16,
+        le=10_000_000,
         description="points sampled on each mesh's surface (points)",
         json_schema_extra={"flag": "samples"},
     )
@@ -26,7 +27,8 @@ class ScanSettings(Settings):
     )
     scale: float = Field(
         1.0,
-        gt=0,
+        ge=1e-9,
+        le=1e9,
         description="metres per unit of the scans, 0.001 for millimetres",
         json_schema_extra={"flag": "scale"},
     )

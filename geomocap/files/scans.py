@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from geomocap.errors import GeometryError
 from geomocap.files.atomic import fingerprint
+from geomocap.files.scan_checks import check_points, check_spacing
 from geomocap.files.scan_geometry import (
     ARRAY_ENDINGS,
     SCAN_ENDINGS,
@@ -29,6 +30,7 @@ from geomocap.files.scan_geometry import (
     read_surface,
 )
 from geomocap.files.scan_settings import ScanSettings
+from geomocap.reading import list_folder
 
 _FARTHEST = 1e5  # diagonals from the origin; ten times farther the equations of motion lose their last digits
 
@@ -96,6 +98,7 @@ class Scans:
             raise GeometryError(f"{name}: {infinite} points are infinite; remove them, or set them to NaN")
         if len(points) > 1 and (points == points[0]).all():
             raise GeometryError(f"{name}: all {len(points)} points coincide; is the file right?")
+        check_points(points, name)
         away, diagonal = np.linalg.norm(points.mean(axis=0)), np.linalg.norm(np.ptp(points, axis=0))
         if len(points) > 1 and away > _FARTHEST * diagonal:
             raise GeometryError(
@@ -120,9 +123,13 @@ class Scans:
     @cached_property
     def spacing(self) -> float:
         """Distance of neighbouring points, metres: as set, or the first scan's mean distance to the nearest one."""
-        if self.settings.spacing is not None:
-            return self.settings.spacing * self.settings.scale
-        return point_spacing(self.points(0))
+        points = self.points(0)
+        if self.settings.spacing is None:
+            return point_spacing(points)
+        given = self.settings.spacing * self.settings.scale
+        if len(points) > 1:
+            check_spacing(given, point_spacing(points), points)
+        return given
 
     def fingerprint(self) -> str:
         """Digest of the files' names, sizes and times."""
@@ -166,7 +173,9 @@ def open_scans(source: Path, settings: ScanSettings) -> Scans:
 
 def _sequence(folder: Path) -> list[Path]:
     """List a folder's scans in the order of their numbers; refuse what is not one sequence."""
-    files = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in SCAN_ENDINGS and not p.name.startswith(".")]
+    files = [
+        p for p in list_folder(folder, GeometryError) if p.suffix.lower() in SCAN_ENDINGS and not p.name.startswith(".")
+    ]
     if not files:
         raise GeometryError(f"{folder}: holds no scans ({', '.join(e[1:] for e in SCAN_ENDINGS)})")
     formats = sorted({p.suffix.lower()[1:] for p in files})

@@ -7,10 +7,13 @@ from typing import Any
 import numpy as np
 
 from geomocap.errors import GeometryError, RunError
+from geomocap.files.array_schema import check_arrays
 from geomocap.files.npz import read_npz, write_npz
 from geomocap.files.ragged_arrays import spread_over_frames
+from geomocap.files.result_schemas import TRACKS_SCHEMA
 from geomocap.files.run import Run
 from geomocap.model.trajectories import REASONS, PathDerivatives, Tracks, Trajectories
+from geomocap.reading import reason
 
 TRACKS = "tracks.npz"
 _OF_TRAJECTORIES = ("sigma", "correlation", "n_views", "ray", "normals", "placed", "end_reason", "begin_reason")
@@ -67,10 +70,14 @@ def _arrays(run: Run, names: tuple[str, ...], needed: tuple[str, ...] = ("positi
     if str(found.get("layout", "")) == "ragged":
         try:
             found |= _dense(found)
-        except (KeyError, IndexError, ValueError) as error:
+        except (KeyError, IndexError, ValueError, TypeError, OverflowError, MemoryError) as error:
             raise _useless(run, error) from None
     if "sight" in found:  # as files of older versions call it
         found.setdefault("ray", found["sight"])
+    try:
+        check_arrays(found, TRACKS_SCHEMA)
+    except GeometryError as error:
+        raise _useless(run, error) from None
     return found
 
 
@@ -89,5 +96,5 @@ def _trajectories(run: Run, found: dict[str, np.ndarray]) -> Trajectories:
 
 
 def _useless(run: Run, error: Exception) -> RunError:
-    reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
-    return RunError(f"{run.path / TRACKS}: {reason}; delete it and run `geomocap track` again")
+    why = f"lacks {error}" if isinstance(error, KeyError) else reason(error)
+    return RunError(f"{run.path / TRACKS}: {why}; delete it and run `geomocap track` again")

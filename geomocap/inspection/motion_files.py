@@ -15,6 +15,7 @@ from geomocap.export.markers import Markers
 from geomocap.export.motion_tree import MotionTree
 from geomocap.export.trc import read_trc
 from geomocap.inspection.description import Description, count, shortened
+from geomocap.reading import read_bytes, reason
 
 ENDINGS = (".bvh", ".trc", ".c3d", ".glb")
 EXTENTS = (0.05, 20.0)  # m; subjects beyond are likely in other units
@@ -82,7 +83,11 @@ def _tell_points(markers: Markers, told: Description) -> None:
 
 
 def _tell_glb(path: Path, told: Description) -> None:
-    data = path.read_bytes()
+    try:
+        data = read_bytes(path)
+    except OSError as error:
+        told.problem(f"{path}: can't be read ({error.strerror or error})")
+        return
     if len(data) < 20 or data[:4] != b"glTF":
         told.problem(f"{path}: no GLB file, it doesn't begin with glTF; export it again")
         return
@@ -105,8 +110,8 @@ def _tell_glb(path: Path, told: Description) -> None:
                 f"animation {animation.get('name', '')}",
                 f"{keys} key frames, {seconds:.2f} s",
             )
-    except (ValueError, KeyError, IndexError, TypeError) as error:
-        told.problem(f"{path}: its JSON is damaged ({type(error).__name__}: {error}); export it again")
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+        told.problem(f"{path}: its JSON is damaged ({reason(error)}); export it again")
         return
     if not names:
         told.problem("it has no skin: there is no skeleton in it")

@@ -10,6 +10,7 @@ import numpy as np
 from geomocap.errors import GeomocapError
 from geomocap.export.run_export import FILES
 from geomocap.export.skeleton_motion import motion_from_skeleton
+from geomocap.files.atomic import remains
 from geomocap.files.results import (
     ELLIPSOIDS,
     KEYPOINTS,
@@ -22,6 +23,7 @@ from geomocap.files.results import (
 )
 from geomocap.files.run import Run
 from geomocap.inspection.description import Description, count, shortened
+from geomocap.subject.subject_model import MODEL_FILE, read_model
 
 
 def describe_run(path: Path) -> Description:
@@ -49,7 +51,14 @@ def describe_run(path: Path) -> Description:
                 told.problem(
                     f"{kind}/ lacks {count(len(missing), 'frame')} from {missing[0]:06d} on; start the run again"
                 )
-    for name, tell in ((ELLIPSOIDS, _ellipsoids), (SKELETON, _skeleton), (TRACKS, _tracks), (KEYPOINTS, _keypoints)):
+    kinds = (
+        (ELLIPSOIDS, _ellipsoids),
+        (SKELETON, _skeleton),
+        (TRACKS, _tracks),
+        (KEYPOINTS, _keypoints),
+        (MODEL_FILE, _model),
+    )
+    for name, tell in kinds:
         if run.has(name):
             try:
                 tell(run, told)
@@ -86,6 +95,14 @@ def _skeleton(run: Run, told: Description) -> None:
         told.problem("body rotations don't begin at the identity: they aren't rotations since the first frame")
 
 
+def _model(run: Run, told: Description) -> None:
+    model = read_model(run.path / MODEL_FILE)
+    bodies = count(model.body_count, "body", "bodies")
+    told.fact(
+        "subject's model", f"{count(len(model.points), 'surface point')} on {bodies}, {model.diagonal:.2f} m across"
+    )
+
+
 def _tracks(run: Run, told: Description) -> None:
     found = read_trajectories(run)
     length = found.lengths
@@ -108,5 +125,7 @@ def _stages(run: Run, told: Description) -> None:
         told.fact(f"time of {name}", f"{timing['seconds']:.1f} s, {timing['items_per_second']:.2f} items/s")
     for name in run.unfinished():
         told.problem(f"stage {name} isn't finished; start the run again and it goes on")
-    for left in run.path.rglob(".*.tmp.*"):
-        told.problem(f"{left.relative_to(run.path)} was left by a killed run; it may be deleted")
+    for name, fault in run.faults().items():
+        told.problem(f"{name} is {fault}; start the run again and it is made again")
+    for left in remains(run.folders()):
+        told.problem(f"{left.relative_to(run.path)} was left by a killed run; the next run removes it")

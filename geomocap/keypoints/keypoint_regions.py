@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated
 
@@ -15,6 +14,7 @@ from geomocap.files.atomic import write_text
 from geomocap.keypoints.keypoint_following import REACH, Measured, follow_keypoints
 from geomocap.model.keypoint_paths import KeyPointPaths, KeyPoints
 from geomocap.model.trajectories import Trajectories
+from geomocap.reading import read_toml
 from geomocap.settings import Settings, check_settings
 from geomocap.trajectories.smoothing import smooth_motion
 
@@ -77,15 +77,7 @@ def read_keypoints(path: Path) -> KeyPointFile:
     SettingsError
         If it can't be read, a key is unknown, a name stands twice, or links name a key-point that isn't there.
     """
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SettingsError(
-            f"{path}: can't be read ({error.strerror}); give key-points as [[keypoint]] tables, "
-            "or place them with --edit"
-        ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path}: not valid TOML ({error})") from None
+    values = read_toml(path, SettingsError, "give key-points as [[keypoint]] tables, or place them with --edit")
     return check_settings(KeyPointFile, values, str(path))
 
 

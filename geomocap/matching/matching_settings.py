@@ -63,12 +63,12 @@ class GrowingSettings(Settings):
     pair_correlation: float = Field(0.9, ge=-1, le=1, description="the same if one search image alone saw the point")
     maximum_sigma0: float = Field(30.0, gt=0, description="greatest a-posteriori sigma (grey levels after filtering)")
     maximum_deviation: float = Field(0.2, gt=0, description="greatest standard deviation in x and in y (px)")
-    iterations: int = Field(10, ge=1, description="limit of iterations, fewer than for single points")
+    iterations: int = Field(10, ge=1, le=1000, description="limit of iterations, fewer than for single points")
     maximum_shift: float = Field(1.5, gt=0, description="farthest way from the start (px)")
     seed_shift: float = Field(4.0, gt=0, description="the same for seeds, whose start is coarser (px)")
     maximum_epipolar: float = Field(0.7, gt=0, description="greatest distance from the epipolar line (px)")
     attempts: int = Field(3, ge=1, le=8, description="neighbours from which a point is tried")
-    hole_passes: int = Field(40, ge=0, description="most rounds of filling holes from all directions")
+    hole_passes: int = Field(40, ge=0, le=1000, description="most rounds of filling holes from all directions")
     agreement: float = Field(0.6, gt=0, description="greatest departure from what a neighbour predicts (px)")
     minimum_patch: float = Field(90.0, ge=0, description="least area of points that hang together (px²)")
     minimum_pair_patch: float = Field(
@@ -86,7 +86,7 @@ class WallisSettings(Settings):
     """Target values of the Wallis filter."""
 
     enabled: bool = Field(True, description="whether images are filtered at all")
-    window: int = Field(41, ge=3, description="edge of the window, odd (px)")
+    window: int = Field(41, ge=3, le=1001, description="edge of the window, odd (px)")
     mean: float = Field(127.0, ge=0, le=255, description="target mean (grey levels)")
     deviation: float = Field(50.0, gt=0, description="target standard deviation (grey levels)")
     brightness: float = Field(1.0, ge=0, le=1, description="b: 1 forces the mean to the target, 0 keeps it")

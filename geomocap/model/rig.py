@@ -7,12 +7,16 @@ minus 0.5.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pycolmap
 
 from geomocap.errors import CalibrationError
+from geomocap.model.orientations import EXACT, NOTED, check_camera, nearest_rotation
+from geomocap.reading import check_name
+
+FARTHEST = 1e7  # metres of a translation; beyond, single numbers of the surface get lost
 
 
 @dataclass(frozen=True)
@@ -26,12 +30,21 @@ class Rig:
     cameras : tuple of C pycolmap.Camera
         Interior orientations (any COLMAP model), pixels.
     cam_from_world : (C, 3, 4) float
-        Exterior orientations [R | t], metres: x_cam = R x_world + t; x right, y down, z forward.
+        Exterior orientations [R | t], metres: x_cam = R x_world + t; x right, y down, z forward. A rotation of few
+        digits is made orthonormal.
+    notes : tuple of str
+        What a user should know of it.
+
+    Raises
+    ------
+    CalibrationError
+        If names, interior or exterior orientations can't be those of cameras.
     """
 
     names: tuple[str, ...]
     cameras: tuple[pycolmap.Camera, ...]
     cam_from_world: np.ndarray
+    notes: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         pose = np.ascontiguousarray(self.cam_from_world, dtype=np.float64)
@@ -42,15 +55,38 @@ class Rig:
                 f"{len(self.names)} camera names, {len(self.cameras)} cameras and poses of shape {pose.shape}: "
                 "expected one camera and one 3×4 pose a name"
             )
-        R = pose[:, :, :3]
-        error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-        for name, e, det in zip(self.names, error, np.linalg.det(R), strict=True):
-            if not np.isfinite(e) or e > 1e-6:
-                raise CalibrationError(f"camera {name}: its rotation is not orthonormal (off by {e:.2g})")
-            if det < 0:
-                raise CalibrationError(f"camera {name}: its rotation mirrors the world (determinant {det:.3f})")
+        pose, notes = np.array(pose), list(self.notes)
+        for name, camera, row in zip(self.names, self.cameras, pose, strict=True):
+            check_name(name, "calibration", CalibrationError)
+            where = f"camera {name}"
+            check_camera(camera, where)
+            R, off = nearest_rotation(row[:, :3], where)
+            if off > EXACT:
+                row[:, :3] = R
+            if off > NOTED:
+                notes.append(f"{where}: its rotation is orthonormal to {off:.1g} only; the nearest rotation is taken")
+            if not np.abs(row[:, 3]).max() <= FARTHEST:
+                raise CalibrationError(
+                    f"{where}: its translation ({', '.join(f'{v:.3g}' for v in row[:, 3])}) can't be metres"
+                )
         pose.flags.writeable = False
         object.__setattr__(self, "cam_from_world", pose)
+        object.__setattr__(self, "notes", tuple(dict.fromkeys(notes)))
+
+    @classmethod
+    def of_file(
+        cls,
+        where: str,
+        names: Iterable[str],
+        cameras: Iterable[pycolmap.Camera],
+        poses: np.ndarray,
+        notes: Iterable[str] = (),
+    ) -> Rig:
+        """Make a rig of what a file says; errors begin with `where`."""
+        try:
+            return cls(tuple(names), tuple(cameras), poses, tuple(notes))
+        except CalibrationError as error:
+            raise CalibrationError(f"{where}: {error}") from None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -60,6 +96,7 @@ class Rig:
             "names": self.names,
             "cameras": [camera.todict() for camera in self.cameras],
             "cam_from_world": np.array(self.cam_from_world),
+            "notes": self.notes,
         }
 
     def __setstate__(self, state: dict) -> None:
@@ -67,6 +104,7 @@ class Rig:
         object.__setattr__(self, "names", state["names"])
         object.__setattr__(self, "cameras", cameras)
         object.__setattr__(self, "cam_from_world", state["cam_from_world"])
+        object.__setattr__(self, "notes", state["notes"])
 
     def select(self, names: Iterable[str]) -> Rig:
         """Return the rig of these cameras only, in this order."""
@@ -75,6 +113,7 @@ class Rig:
             tuple(self.names[i] for i in index),
             tuple(self.cameras[i] for i in index),
             self.cam_from_world[index],
+            self.notes,
         )
 
     @property
@@ -173,7 +212,7 @@ class Rig:
             size = (high - low).astype(int)
             params = [fx, fy, *(center - low)]
             cameras.append(pycolmap.Camera(model="PINHOLE", width=int(size[0]), height=int(size[1]), params=params))
-        return Rig(self.names, tuple(cameras), np.array(self.cam_from_world))
+        return Rig(self.names, tuple(cameras), np.array(self.cam_from_world), self.notes)
 
     def undistortion_map(self, camera: int) -> tuple[np.ndarray, np.ndarray]:
         """Say where each pixel of the undistorted image comes from, as `cv2.remap` wants it.

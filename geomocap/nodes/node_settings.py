@@ -10,11 +10,11 @@ from geomocap.settings import Settings
 class NodeTrackingSettings(Settings):
     """How nodes of a surface are followed through point sets."""
 
-    nodes: int = Field(1000, ge=20, description="nodes to follow", json_schema_extra={"flag": "nodes"})
-    coarse_nodes: int = Field(220, ge=10, description="nodes of the coarse graph that finds the motion first")
-    points: int = Field(5000, ge=100, description="points of a frame that are used (points)")
+    nodes: int = Field(1000, ge=20, le=100000, description="nodes to follow", json_schema_extra={"flag": "nodes"})
+    coarse_nodes: int = Field(220, ge=10, le=20000, description="nodes of the coarse graph that finds the motion first")
+    points: int = Field(5000, ge=100, le=1000000, description="points of a frame that are used (points)")
     coarse_points: int = Field(
-        1800, ge=100, description="points of a frame that the coarse graph is fitted to (points)"
+        1800, ge=100, le=1000000, description="points of a frame that the coarse graph is fitted to (points)"
     )
     neighbours: int = Field(9, ge=4, le=60, description="neighbours that make a point's normal")
     stiffness: float = Field(

@@ -13,7 +13,7 @@ import numpy as np
 
 from geomocap.calibration.silhouette_correction import correct_cameras
 from geomocap.calibration.silhouette_tangents import OutlineRays
-from geomocap.files.camera_files import CAMERAS, SPARSE, as_seen, write_cameras
+from geomocap.files.camera_files import CAMERAS, SPARSE_FILES, as_seen, write_cameras
 from geomocap.files.capture import Capture
 from geomocap.files.run import stage_key
 from geomocap.model.camera_correction import CameraCorrection
@@ -50,7 +50,7 @@ def with_cameras(job: Job) -> tuple[Job, str]:
         write_cameras(job.run, find_correction(job, capture))
         return len(capture.cameras)
 
-    job.stage("cameras", key, [], work, [CAMERAS, SPARSE])
+    job.stage("cameras", key, [], work, [CAMERAS, *SPARSE_FILES])
     return replace(job, capture=as_seen(job.run, capture)), key
 
 

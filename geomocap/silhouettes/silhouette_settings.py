@@ -13,6 +13,7 @@ class SilhouetteSettings(Settings):
     samples: int = Field(
         30,
         ge=2,
+        le=10000,
         description="Frames, spread over the recording, from which a camera's background is learnt.",
         json_schema_extra={"flag": "background-samples"},
     )

@@ -31,10 +31,11 @@ class RefinementSettings(Settings):
     rounds: int = Field(
         default=3,
         ge=0,
+        le=1000,
         description="rounds of skin weights, shape, and motion with joints; 0: no refinement",
         json_schema_extra={"flag": "refinement"},
     )
-    steps: int = Field(default=4, ge=1, description="steps of each adjustment of motion and joints")
+    steps: int = Field(default=4, ge=1, le=1000, description="steps of each adjustment of motion and joints")
     independence: float = Field(
         default=0.3, gt=0, le=1, description="fraction of the observations that err independently of each other (0..1)"
     )

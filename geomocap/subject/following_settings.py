@@ -10,14 +10,17 @@ from geomocap.settings import Settings
 class FollowingSettings(Settings):
     """How the model of a subject is followed through another sequence."""
 
-    points: int = Field(default=1200, ge=100, description="points of the model, and of each frame, that are matched")
+    points: int = Field(
+        default=1200, ge=100, le=1000000, description="points of the model, and of each frame, that are matched"
+    )
     start_frames: int = Field(
         default=4,
         ge=1,
+        le=1000,
         description="frames in which the model is looked for",
     )
-    steps: int = Field(default=8, ge=1, description="times that points are matched anew in each frame")
-    rounds: int = Field(default=5, ge=0, description="rounds in which all frames are fitted together")
+    steps: int = Field(default=8, ge=1, le=1000, description="times that points are matched anew in each frame")
+    rounds: int = Field(default=5, ge=0, le=1000, description="rounds in which all frames are fitted together")
     normal: float = Field(default=0.03, ge=0, description="weight of normals in matching (diagonals)")
     color: float = Field(default=0.03, ge=0, description="weight of colours in matching (diagonals)")
     reach: float = Field(default=0.1, gt=0, description="points farther apart don't match (diagonals)")

@@ -10,15 +10,40 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError, RunError
+from geomocap.files.array_schema import Expected, check_arrays
 from geomocap.files.npz import read_npz, write_npz
 from geomocap.model.hierarchy import Hierarchy
+from geomocap.reading import reason
 from geomocap.skeleton.body_observations import SkinPoints
 from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, body_motion, posed
 
 MODEL_FILE = "model.npz"
 KIND = "geomocap subject model"
 VERSION = 1
+_SINGLE = {"root": int, "diagonal": float, "spacing": float, "up": int}
 _BEFORE = {"skin_shares": "skin_weights", "extent": "diagonal"}  # arrays as older versions call them
+
+SCHEMA = {
+    "points": Expected("P 3", low=-1e5, high=1e5),
+    "normals": Expected("P 3", "direction", gaps=True),
+    "colors": Expected("C 3", "whole", low=0, high=255),
+    "skin_bodies": Expected("P I", "whole", low=0, high="B"),
+    "skin_weights": Expected("P I", low=0, high=1.01),
+    "joint_bodies": Expected("J 2", "whole", low=0, high="B"),
+    "joints": Expected("J 3", low=-1e5, high=1e5),
+    "joint_axes": Expected("J 3", "direction"),
+    "joint_hinge": Expected("J", "truth"),
+    "joint_limits": Expected("J 2 3", low=-7, high=7),
+    "joint_names": Expected("J", "text"),
+    "body_names": Expected("B", "text"),
+    "root": Expected("", "whole", low=0, high="B"),
+    "origin": Expected("3", low=-1e5, high=1e5),
+    "body_extents": Expected("B 3", low=0, high=1e5),
+    "poses": Expected("K B 3 3", "rotation"),
+    "diagonal": Expected("", low=1e-9, high=1e5),
+    "spacing": Expected("", low=1e-9, high=1e5),
+    "up": Expected("", "whole", low=0, high=2),
+}
 
 
 @dataclass(frozen=True)
@@ -86,39 +111,21 @@ class SubjectModel:
     up: int = 2
 
     def __post_init__(self) -> None:
-        count, joints = len(self.points), len(self.joint_bodies)
-        bodies, influences = joints + 1, np.shape(self.skin_bodies)[-1:]
-        expected = {
-            "points": (count, 3),
-            "normals": (count, 3),
-            "skin_bodies": (count, *influences),
-            "skin_weights": (count, *influences),
-            "joints": (joints, 3),
-            "joint_axes": (joints, 3),
-            "joint_hinge": (joints,),
-            "joint_limits": (joints, 2, 3),
-            "joint_names": (joints,),
-            "body_names": (bodies,),
-            "origin": (3,),
-            "body_extents": (bodies, 3),
-            "poses": (len(self.poses), bodies, 3, 3),
-        }
-        for name, shape in expected.items():
-            if getattr(self, name).shape != shape:
-                raise GeometryError(f"{name} has shape {getattr(self, name).shape}, expected {shape}")
-        if self.colors.shape not in ((count, 3), (0, 3)):
-            raise GeometryError(f"colors have shape {self.colors.shape}, expected {(count, 3)} or none")
-        if not count or not len(self.poses):
+        bodies = len(self.joint_bodies) + 1
+        sizes = check_arrays({name: getattr(self, name) for name in SCHEMA}, SCHEMA, B=bodies)
+        if sizes["C"] not in (sizes["P"], 0):
+            raise GeometryError(f"colors has the shape {self.colors.shape}, expected {sizes['P']} × 3 or none")
+        if not sizes["P"] or not sizes["K"]:
             raise GeometryError("it has no surface points or no poses")
-        if self.skin_bodies.min() < 0 or self.skin_bodies.max() >= bodies or not 0 <= self.root < bodies:
-            raise GeometryError(f"it names bodies that are not among its {bodies}")
-        for name in ("points", "normals", "skin_weights", "joints", "joint_axes", "poses", "origin"):
-            if not np.isfinite(getattr(self, name)).all():
-                raise GeometryError(f"{name} holds numbers that are not finite")
-        if self.up not in (0, 1, 2):
-            raise GeometryError(f"up is {self.up}, expected an axis, 0 to 2")
-        if not (self.diagonal > 0 and self.spacing > 0):
-            raise GeometryError("diagonal and spacing must be positive")
+        if not self.normals.any():
+            raise GeometryError("normals are all zero")
+        if not np.allclose(self.skin_weights.sum(axis=1), 1, atol=0.01):
+            raise GeometryError("skin_weights doesn't sum to one at every point")
+        across = float(np.linalg.norm(np.ptp(self.points, axis=0)))
+        if not across / 4 <= self.diagonal <= 4 * across:
+            raise GeometryError(f"diagonal is {self.diagonal:g} m, but its points are {across:g} m across")
+        if not self.spacing <= across:
+            raise GeometryError(f"spacing is {self.spacing:g} m, but its points are {across:g} m across")
         _ = self.linkage  # the tree is checked
 
     @property
@@ -196,11 +203,12 @@ def read_model(path: Path) -> SubjectModel:
         raise GeometryError(f"{path}: no such model; a run by motion writes its subject's as model.npz")
     try:
         arrays = read_npz(path)
-    except RunError:
-        raise GeometryError(f"{path}: can't be read as a model; expected a run's model.npz") from None
+    except RunError as error:
+        why = str(error).removeprefix(f"{path}: ").partition(";")[0]
+        raise GeometryError(f"{path}: can't be read as a model ({why}); expected a run's model.npz") from None
     if str(arrays.get("kind", "")) != KIND:
         raise GeometryError(f"{path}: no subject model; expected a run's model.npz")
-    if arrays.get("version") != VERSION:
+    if str(arrays.get("version", "")) != str(VERSION):
         raise GeometryError(f"{path}: model of version {arrays.get('version')}, expected {VERSION}; make it anew")
     arrays |= {now: arrays[before] for before, now in _BEFORE.items() if before in arrays}
     names = list(SubjectModel.__dataclass_fields__)
@@ -209,8 +217,10 @@ def read_model(path: Path) -> SubjectModel:
         raise GeometryError(f"{path}: model without the array {missing[0]}; make it anew")
     values: dict[str, Any] = {name: arrays[name] for name in names}
     try:
-        for name, kind in (("root", int), ("diagonal", float), ("spacing", float), ("up", int)):
-            values[name] = kind(values[name])
+        check_arrays(
+            values, {name: SCHEMA[name] for name in _SINGLE} | {"joint_bodies": Expected("J 2", "whole")}, B=1 << 30
+        )
+        values |= {name: kind(values[name]) for name, kind in _SINGLE.items()}
         return SubjectModel(**values)
-    except (GeometryError, TypeError, ValueError) as error:
-        raise GeometryError(f"{path}: model can't be used: {error}; make it anew") from None
+    except (GeometryError, TypeError, ValueError, IndexError, OverflowError) as error:
+        raise GeometryError(f"{path}: model can't be used: {reason(error)}; make it anew") from None

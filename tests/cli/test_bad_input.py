@@ -49,7 +49,7 @@ def test_truncated_png(capture, geomocap, tmp_path):
     file = sorted((capture / "images").iterdir())[1] / "000003.png"
     file.write_bytes(file.read_bytes()[:5000])
     said = refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
-    assert f"{file}: truncated" in said
+    assert f"{file}: damaged or truncated" in said
 
 
 def test_truncated_video(capture, geomocap, tmp_path):

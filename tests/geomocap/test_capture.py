@@ -121,7 +121,7 @@ def test_truncated_png(tmp_path):
     make_capture(tmp_path)
     file = tmp_path / "images/cam1/000001.png"
     file.write_bytes(file.read_bytes()[:200])
-    with pytest.raises(CaptureError, match=r"cam1/000001\.png: truncated"):
+    with pytest.raises(CaptureError, match=r"cam1/000001\.png: damaged or truncated"):
         Capture.open(tmp_path).frame("cam1", 1)
 
 
@@ -182,11 +182,11 @@ def test_a_turned_photograph_has_the_size_as_it_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("fps = -3", "fps: Input should be greater than 0"),
-        ("name = 'x'", "fps: Field required"),
-        ("fps = 30\nspeed = 3", "speed: Extra inputs"),
+        ("fps = -3", "fps: must be greater than"),
+        ("name = 'x'", "fps: is missing"),
+        ("fps = 30\nspeed = 3", "speed: no such key"),
         ("fps = ", "not valid TOML"),
-        ("fps = 30\nup = 'x'", "up: Input should be 'y' or 'z'"),
+        ("fps = 30\nup = 'x'", "up: must be 'y' or 'z'"),
         ("fps = 30\ncameras = ['cam1', 'cam1']", "cameras: camera cam1 is there more than once"),
         ("fps = 30\nregion_of_interest = [[0, 1, 0], [1, 0, 1]]", "region_of_interest: expected the corners"),
         ("fps = 30\nframes = [2, 1]", r"frames: expected the first and the last frame to use, got \[2, 1\]"),

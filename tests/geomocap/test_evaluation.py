@@ -248,7 +248,7 @@ NAN = np.full((16, 5, 3), np.nan)
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"fps": np.array(0.0)}, "fps is 0.0"),
+        ({"fps": np.array(0.0)}, "fps is 0,"),
         ({"fps": np.array(30.0)}, "its skeleton has 15 frames per second, the truth 30"),
         ({"joint_positions": NAN}, "joint_positions holds NaN or infinity in frame 0"),
         ({"vertices": np.zeros((0, 4, 3))}, "vertices has shape"),

@@ -132,7 +132,8 @@ def test_spacing_is_the_mean_distance_to_the_nearest_point(tmp_path):
     x = np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(-1, 3) * 0.02
     np.save(tmp_path / "g.npy", x)
     assert open_scans(tmp_path / "g.npy", ScanSettings()).spacing == pytest.approx(0.02)
-    assert open_scans(tmp_path / "g.npy", ScanSettings(spacing=5, scale=0.001)).spacing == pytest.approx(0.005)
+    np.save(tmp_path / "mm.npy", 1000 * x)
+    assert open_scans(tmp_path / "mm.npy", ScanSettings(spacing=5, scale=0.001)).spacing == pytest.approx(0.005)
 
 
 def test_up_is_recorded_and_changes_no_points(tmp_path):
