@@ -42,8 +42,10 @@ from geomocap.export.markers import markers_from_run
 from geomocap.export.names import Names
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.trc import write_trc
+from geomocap.files.camera_file import read_camera_doubts
 from geomocap.files.capture import read_capture_info
 from geomocap.files.check_file import read_self_check
+from geomocap.files.corrected_cameras import camera_warnings
 from geomocap.files.frame_files import read_points, read_voxels, write_voxels
 from geomocap.files.images import image_size, read_image
 from geomocap.files.results import (
@@ -276,6 +278,14 @@ READERS: dict[str, Reader] = {
     "matches": Reader(_text("m.toml", 'joint_a = "LKNE"\n'), read_matches),
     "points.csv": Reader(_text("p.csv", "frame,camera,point,x,y\n0,a,0,1.5,2.5\n1,b,1,3,4\n"), read_observed),
     "check.json": Reader(_text("check.json", json.dumps(_CHECK)), _of_run(read_self_check)),
+    "correction.json": Reader(
+        _text("correction.json", '{"disagreement_px": 9.5, "left_px": 1.5, "corrected": true}'),
+        _of_run(camera_warnings),
+    ),
+    "cameras.json": Reader(
+        _text("cameras.json", '{"contradicting": ["a"], "left_out": [], "warnings": ["b"]}'),
+        _of_run(read_camera_doubts),
+    ),
     "diagnostics.json": Reader(_text("diagnostics.json", '{"warnings": ["a"]}'), _of_run(read_warnings)),
     "cameras.bin": Reader(_binary_model("cameras.bin"), lambda file: read_rig(file.parent)),
     "images.bin": Reader(_binary_model("images.bin"), lambda file: read_rig(file.parent)),

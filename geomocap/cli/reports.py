@@ -13,6 +13,7 @@ from geomocap.errors import GeomocapError, RunError
 from geomocap.files.atomic import fingerprint
 from geomocap.files.camera_file import read_camera_doubts
 from geomocap.files.capture import Capture
+from geomocap.files.corrected_cameras import as_seen
 from geomocap.files.results import read_cloud_record, read_warnings
 from geomocap.files.run import Run, stage_key
 from geomocap.files.run_lock import working_in
@@ -45,6 +46,7 @@ def review_job(job: Job, made_from: str) -> None:
 
 def review_run(run: Run, capture: Capture | None, progress: Progress = silent) -> list[Path]:
     """Make pictures and report of a run, with a frame's surface measured again where it was measured."""
+    capture = None if capture is None else as_seen(run, capture)
     return review(run, capture, measured=partial(measure_again, run, capture), progress=progress)
 
 
@@ -94,7 +96,8 @@ def capture_of(run: Run) -> Capture | None:
     if source.get("kind") != "capture":
         return None
     try:
-        return without_left_out(Capture.open(Path(source["path"])), read_camera_doubts(run))
+        opened = without_left_out(Capture.open(Path(source["path"])), read_camera_doubts(run))
+        return as_seen(run, opened)
     except GeomocapError as error:
         tell_note(f"the capture can't be shown ({error})")
         return None

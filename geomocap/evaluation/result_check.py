@@ -23,6 +23,7 @@ from geomocap.carving.silhouette_views import PinholeViews, Undistortion
 from geomocap.carving.visibility import SurfaceVoxels, depth_buffers
 from geomocap.carving.voxel_grid import Grid
 from geomocap.files.capture import Capture
+from geomocap.files.corrected_cameras import as_seen
 from geomocap.files.results import read_diagnostics, read_silhouette, read_skeleton
 from geomocap.files.run import Run
 from geomocap.model.ray_casting import TriangleScene
@@ -52,6 +53,7 @@ def check_run(run: Run, capture: Capture) -> SelfCheck | None:
     needed = (MODEL_FILE, "skeleton.npz", "silhouettes")
     if not capture.is_calibrated or not all((run.path / name).exists() for name in needed):
         return None
+    capture = as_seen(run, capture)
     skeleton, mesh = read_skeleton(run), model_mesh(read_model(run.path / MODEL_FILE), MESH_TRIANGLES)
     undistortion = Undistortion.of(capture.rig)
     chosen = np.unique(np.linspace(0, len(skeleton.body_rotations) - 1, FRAMES).round().astype(int))

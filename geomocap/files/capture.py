@@ -4,7 +4,7 @@ capture.toml                     name, fps, length_unit, up; optional: cameras, 
                                  region_of_interest
 images/<camera>/000000.png       or videos/<camera>.mp4
 background/<camera>.png          optional
-masks/<camera>/000000.png        optional, used as they are
+masks/<camera>/000000.png        optional, used as they are; with masks there may be no images at all
 sparse/                          calibration, a COLMAP model
 bar/<camera>/000000.png          optional reference-bar recording
 """
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, Protocol
@@ -113,12 +113,15 @@ class Capture:
         Camera names in the order used everywhere.
     sources : dict of str to FrameSource
         All that was recorded, also what isn't used.
+    corrected : Rig, optional
+        Cameras to use instead of the calibration.
     """
 
     path: Path
     info: CaptureInfo
     cameras: tuple[str, ...]
     sources: dict[str, FrameSource]
+    corrected: Rig | None = None
 
     @classmethod
     def open(cls, path: Path) -> Capture:
@@ -137,7 +140,7 @@ class Capture:
         info = read_capture_info(path)
         found = _find_sources(path)
         if not found:
-            raise CaptureError(f"{path}: holds neither images/<camera>/*.png nor videos/<camera>.mp4")
+            raise CaptureError(f"{path}: holds neither images/<camera>/*.png nor videos/<camera>.mp4 nor masks")
         names = info.cameras or tuple(sorted(found))
         for name in names:
             if name not in found:
@@ -212,6 +215,11 @@ class Capture:
         return next((f for f in files if f.is_file()), None)
 
     @property
+    def has_images(self) -> bool:
+        """Whether there are images; otherwise the frames are those of the given silhouettes."""
+        return any((self.path / part).is_dir() for part in ("images", "videos"))
+
+    @property
     def has_masks(self) -> bool:
         """Whether the capture brings its own silhouettes."""
         return (self.path / "masks").is_dir()
@@ -271,6 +279,8 @@ class Capture:
         CaptureError
             If an image's size is not the one that the camera is calibrated for.
         """
+        if self.corrected is not None:
+            return self.corrected
         if not self.is_calibrated:
             raise CaptureError(f"{self.path}: not calibrated, no folder sparse/; run `geomocap calibrate {self.path}`")
         if len(self.cameras) < 2:
@@ -291,7 +301,12 @@ class Capture:
         kept = tuple(c for c in self.cameras if c not in cameras)
         template = self.info.template_camera if self.info.template_camera in kept else None
         info = self.info.model_copy(update={"template_camera": template})
-        return Capture(self.path, info, kept, {c: self.sources[c] for c in kept})
+        corrected = None if self.corrected is None else self.corrected.select(kept)
+        return replace(self, info=info, cameras=kept, sources={c: self.sources[c] for c in kept}, corrected=corrected)
+
+    def with_rig(self, rig: Rig) -> Capture:
+        """Return the capture with other cameras than those it is calibrated with."""
+        return replace(self, corrected=rig)
 
     def fingerprint(self, *parts: str) -> str:
         """Digest of the names, sizes and times of the files of these parts ("images", "masks", "sparse" …)."""
@@ -356,9 +371,19 @@ def _entries(folder: Path) -> list[Path]:
 
 
 def _find_sources(path: Path) -> dict[str, FrameSource]:
+    """Frames by camera: images, videos, or if there are neither, the given silhouettes."""
+    sources = _image_folders(path / "images")
+    for file in _entries(path / "videos"):
+        if file.suffix.lower() in VIDEO_ENDINGS and file.stem not in sources:
+            check_name(file.stem, str(path / "videos"), CaptureError)
+            sources[file.stem] = Video(file)
+    return sources or _image_folders(path / "masks")
+
+
+def _image_folders(parent: Path) -> dict[str, FrameSource]:
     sources: dict[str, FrameSource] = {}
-    for folder in (p for p in _entries(path / "images") if p.is_dir()):
-        check_name(folder.name, str(path / "images"), CaptureError)
+    for folder in (p for p in _entries(parent) if p.is_dir()):
+        check_name(folder.name, str(parent), CaptureError)
         files = tuple(f for f in list_folder(folder, CaptureError) if f.suffix.lower() in IMAGE_ENDINGS)
         for k, file in enumerate(files):
             if file.stem != f"{k:06d}":
@@ -366,8 +391,4 @@ def _find_sources(path: Path) -> dict[str, FrameSource]:
         if not files:
             raise CaptureError(f"{folder}: holds no frames (000000.png …)")
         sources[folder.name] = ImageFolder(files)
-    for file in _entries(path / "videos"):
-        if file.suffix.lower() in VIDEO_ENDINGS and file.stem not in sources:
-            check_name(file.stem, str(path / "videos"), CaptureError)
-            sources[file.stem] = Video(file)
     return sources

@@ -47,7 +47,7 @@ _OWN = {  # folders of stages, and what is theirs there though no record says so
 }
 _RESULTS = (  # as stages call them
     *(f"{name}.npz" for name in ("diagnostics", "ellipsoids", "keypoints", "model", "skeleton", "tracks")),
-    *("motion.*", "check.json"),
+    *("motion.*", "angles.*", "check.json", "cameras.json", "correction.json", "sparse/cameras.txt"),
 )
 
 

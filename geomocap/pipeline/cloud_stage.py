@@ -18,8 +18,10 @@ from geomocap.dense.matching_images import undistorted_color
 from geomocap.errors import CaptureError, GeometryError, GeomocapError
 from geomocap.evaluation.camera_check import BACKGROUND_FRAMES
 from geomocap.files.capture import Capture
+from geomocap.files.corrected_cameras import as_seen
 from geomocap.files.results import read_silhouette, read_voxels, write_cloud_record, write_points
 from geomocap.files.run import Run, stage_key
+from geomocap.pipeline.correction_stage import with_cameras
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.silhouette_stage import silhouettes
 from geomocap.pipeline.voxel_stage import voxels
@@ -33,9 +35,13 @@ def clouds(job: Job) -> str:
     capture = job.capture
     if capture is None:
         raise CaptureError("clouds need a capture")
+    check_images(capture)
     settings = cloud_settings(job.config.cloud, capture)
-    groups = match_groups(capture.rig, settings.groups, capture.info.region_of_interest)
     bounds = bounds_of(capture, settings)
+    if bounds != "none":
+        job, _ = with_cameras(job)
+        capture = as_seen(job.run, capture)
+    groups = match_groups(capture.rig, settings.groups, capture.info.region_of_interest)
     before = {"hull": voxels, "silhouettes": silhouettes, "none": lambda _: ""}[bounds](job)
     pictures = capture.fingerprint("images", "videos", "sparse")
     key = stage_key(
@@ -60,6 +66,12 @@ def clouds(job: Job) -> str:
 
     job.write_record("cloud")
     return job.stage("cloud", key, ["cloud"], work)
+
+
+def check_images(capture: Capture) -> None:
+    """Raise CaptureError if a capture holds silhouettes only."""
+    if not capture.has_images:
+        raise CaptureError(f"{capture.path}: holds masks without images; surface is measured and followed in images")
 
 
 def cloud_files(run: Run, frame: int) -> list[Path]:
@@ -140,6 +152,7 @@ def measure_again(run: Run, capture: Capture | None, frame: int) -> tuple[CloudF
     """
     if capture is None or not capture.is_calibrated:
         return None
+    capture = as_seen(run, capture)
     settings = cloud_settings(load_config(run.path / "run.toml").cloud, capture)
     groups = match_groups(capture.rig, settings.groups, capture.info.region_of_interest)
     try:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geomocap.files.atomic import fingerprint
+from geomocap.files.corrected_cameras import camera_warnings
 from geomocap.files.results import (
     WARNINGS,
     read_trajectories,
@@ -39,7 +40,7 @@ def segment_with_model(job: Job, geometry: Geometry, source_key: str) -> str:
     model = read_model(job.model).turned_up(job.up_axis)
     patches = None
     wanted = job.config.segmentation.paths
-    if job.capture is not None and wanted != "nodes":
+    if job.capture is not None and job.capture.has_images and wanted != "nodes":
         patches = tracks(job)
     key = stage_key(
         __name__,
@@ -90,7 +91,8 @@ def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) ->
         joint_axes=posed(model.linkage, followed.bodies, 0).axes,
     )
     write_diagnostics(job.run, made)
-    write_warnings(job.run, _fit_warnings(model, followed, job.config.following.poor_fit))
+    told = _fit_warnings(model, followed, job.config.following.poor_fit)
+    write_warnings(job.run, [*camera_warnings(job.run), *told])
     return frames
 
 

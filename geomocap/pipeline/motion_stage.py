@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geomocap.files.corrected_cameras import camera_warnings
 from geomocap.files.results import write_diagnostics, write_ellipsoids, write_points, write_skeleton, write_warnings
 from geomocap.files.run import Run
 from geomocap.model.diagnostics import Diagnostics
@@ -37,7 +38,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     job.run.note("segmentation", [job.run.frame_file("bodies", k) for k in range(frames)])
     write_ellipsoids(job.run, Ellipsoids.stack(fitted, np.arange(bodies.body_count, dtype=np.int32)))
     write_skeleton(job.run, found.skeleton)
-    warnings = [*motion.warnings, *make_model(job, geometry, motion)]
+    warnings = [*camera_warnings(job.run), *motion.warnings, *make_model(job, geometry, motion)]
     if warnings:
         write_warnings(job.run, warnings)
     made = Diagnostics(

@@ -69,7 +69,11 @@ def _doubting(job: Job, work: Callable[[], int]) -> int:
 
 def _is_tracked(job: Job, source: Source) -> bool:
     """Whether the surface is to be tracked in the images, which takes a volume."""
-    if job.capture is None or job.config.segmentation.paths in ("nodes", "points", "ellipsoids"):
+    if (
+        job.capture is None
+        or not job.capture.has_images
+        or job.config.segmentation.paths in ("nodes", "points", "ellipsoids")
+    ):
         return False
     return source != "cloud" or bounds_of(job.capture, job.config.cloud) == "hull"
 

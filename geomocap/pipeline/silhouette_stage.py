@@ -12,6 +12,7 @@ from geomocap.evaluation.camera_check import BACKGROUND_FRAMES
 from geomocap.files.capture import Capture
 from geomocap.files.images import write_mask
 from geomocap.files.run import Run, stage_key
+from geomocap.pipeline.correction_stage import with_cameras
 from geomocap.pipeline.job import Job
 from geomocap.scheduling import map_items
 from geomocap.silhouettes.background import BackgroundModel, model_from_frames, model_from_plate
@@ -23,6 +24,7 @@ from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 def silhouettes(job: Job) -> str:
     """Make the silhouettes of all cameras and frames, and return the stage's key."""
+    job, cameras = with_cameras(job)
     capture = job.capture
     if capture is None:
         raise CaptureError("silhouettes need a capture")
@@ -33,6 +35,7 @@ def silhouettes(job: Job) -> str:
         capture.fingerprint("images", "videos", "background", "masks", "sparse"),
         job.config.silhouettes.model_dump(),
         capture.cameras,
+        cameras,
     )
     job.write_record("silhouettes")
     return job.stage("silhouettes", key, ["silhouettes"], lambda: _make_silhouettes(job, capture))

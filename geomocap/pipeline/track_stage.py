@@ -20,7 +20,8 @@ from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.patches.point_tracking import track_points
 from geomocap.patches.seeding import image_reduction
-from geomocap.pipeline.cloud_stage import clouds
+from geomocap.pipeline.cloud_stage import check_images, clouds
+from geomocap.pipeline.correction_stage import with_cameras
 from geomocap.pipeline.derived import KEYPOINT_FILES
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.voxel_stage import voxels
@@ -34,9 +35,11 @@ def tracks(job: Job) -> str:
     The surface is that of the voxels; where cameras are too few for a hull, the measured cloud. It is made first if
     need be.
     """
+    job, _ = with_cameras(job)
     capture = job.capture
     if capture is None:
         raise CaptureError("tracks need a capture")
+    check_images(capture)
     pictures = capture.fingerprint("images", "videos", "sparse")
     tables = ("tracking", "filters", "smoothing")
     settings = {name: getattr(job.config, name).model_dump() for name in tables}

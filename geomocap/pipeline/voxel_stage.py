@@ -17,6 +17,7 @@ from geomocap.errors import CaptureError
 from geomocap.files.capture import Capture
 from geomocap.files.results import read_silhouette, write_voxels
 from geomocap.files.run import Run, stage_key
+from geomocap.pipeline.correction_stage import with_cameras
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.silhouette_stage import silhouettes
 from geomocap.scheduling import map_items
@@ -26,6 +27,7 @@ VOLUME_FRAMES = 60  # the working volume is found from at most so many frames, s
 
 def voxels(job: Job) -> str:
     """Carve all frames, silhouettes first if need be, and return the stage's key."""
+    job, _ = with_cameras(job)
     capture = job.capture
     if capture is None:
         raise CaptureError("voxels need a capture")
@@ -90,7 +92,7 @@ class _Carve:
     def __call__(self, frame: int) -> None:
         assert self.grid is not None
         images = None
-        if needs_images(self.settings):
+        if self.capture.has_images and needs_images(self.settings):
             images = self.undistortion.images([self.capture.frame(c, frame) for c in self.capture.cameras])
         found = carve_frame(self.checked_views(frame), self.grid, self.settings, images, frame)
         write_voxels(self.run.frame_file("voxels", frame), found)

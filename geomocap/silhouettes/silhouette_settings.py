@@ -22,6 +22,11 @@ class SilhouetteSettings(Settings):
         description="All cameras decide together, if they are calibrated: what no other camera confirms goes, and what "
         "the others see counts where a camera is undecided.",
     )
+    correct_cameras: bool = Field(
+        default=True,
+        description="Where the outlines contradict the calibration by more than they do each other once the cameras' "
+        "poses are adjusted, the run uses adjusted cameras.",
+    )
     gain: bool = Field(
         default=True, description="Follow slow light changes by a gain and an offset per frame and channel."
     )

@@ -1,0 +1,128 @@
+"""Stage: calibration → cameras, corrected where the silhouettes contradict it: `correction.json`, `sparse/`.
+
+The outlines are those of reduced images in which each camera decides alone, as the silhouettes themselves need the
+cameras; given masks are taken as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from geomocap.calibration.silhouette_correction import correct_cameras
+from geomocap.calibration.silhouette_tangents import OutlineRays
+from geomocap.files.capture import Capture
+from geomocap.files.corrected_cameras import CORRECTION, SPARSE_FILES, as_seen, write_cameras
+from geomocap.files.run import stage_key
+from geomocap.model.camera_correction import CameraCorrection
+from geomocap.pipeline.job import Job
+from geomocap.scheduling import map_items
+from geomocap.silhouettes.background import BackgroundModel, model_from_frames, model_from_plate
+from geomocap.silhouettes.silhouette_scene import SilhouetteScene, learning_frames
+from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
+
+OUTLINES = 32  # frames, spread over the recording
+LONGEST = 640  # longer side of the images, pixels
+
+
+def with_cameras(job: Job) -> tuple[Job, str]:
+    """Hold a capture's calibration against its outlines; return the job with the cameras to use, and the stage's key.
+
+    A capture without calibration stays as it is.
+    """
+    capture = job.capture
+    if capture is None or not capture.is_calibrated:
+        return job, ""
+    parts = ("images", "videos", "background", "masks", "sparse")
+    key = stage_key(
+        __name__,
+        "correction",
+        str(capture.path.resolve()),
+        capture.fingerprint(*parts),
+        job.config.silhouettes.model_dump(),
+        capture.cameras,
+    )
+
+    def work() -> int:
+        if not job.config.silhouettes.correct_cameras:
+            return 0
+        write_cameras(job.run, find_correction(job, capture))
+        return len(capture.cameras)
+
+    job.write_record("silhouettes")
+    job.stage("correction", key, [], work, [CORRECTION, *SPARSE_FILES])
+    return replace(job, capture=as_seen(job.run, capture)), key
+
+
+def find_correction(job: Job, capture: Capture) -> CameraCorrection:
+    """Hold the calibration against the outlines of frames spread over the recording."""
+    rig = capture.rig
+    shrink = 1 if capture.has_masks else max(1, round(int(rig.sizes.max()) / LONGEST))
+    chosen = np.unique(np.linspace(0, capture.n_frames - 1, min(OUTLINES, capture.n_frames)).round().astype(int))
+    if capture.has_masks:
+        masks = [tuple(capture.mask(c, int(k)) for c in capture.cameras) for k in chosen]
+    else:
+        masks = _cut_alone(job, capture, chosen.tolist(), shrink)
+    return correct_cameras(rig, OutlineRays.of(rig, masks), float(shrink))
+
+
+def _cut_alone(job: Job, capture: Capture, frames: list[int], shrink: int) -> list[tuple[np.ndarray, ...]]:
+    """Silhouettes of reduced images, each camera alone."""
+    settings = job.config.silhouettes
+    learn = _LearnReduced(capture, settings, shrink)
+    models = list(map_items(learn, capture.cameras, job.executor, "cameras", job.progress, 2))
+    scene = SilhouetteScene.unlearnt(models, None, settings)
+    read = _ReadReduced(capture, shrink)
+    scene = scene.learnt(scene.count(read(k)) for k in learning_frames(capture.n_frames))
+    return list(map_items(_CutReduced(read, scene), frames, job.executor, "cameras", job.progress, 4))
+
+
+def _reduced(image: np.ndarray, shrink: int) -> np.ndarray:
+    """Reduce an image by a whole factor; a size that it doesn't divide is rounded up."""
+    h, w = image.shape[:2]
+    size = -(-w // shrink), -(-h // shrink)
+    return image if shrink == 1 else np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+
+
+@dataclass(frozen=True)
+class _ReadReduced:
+    """Reduced images of one frame."""
+
+    capture: Capture
+    shrink: int
+
+    def __call__(self, frame: int) -> list[np.ndarray]:
+        return [_reduced(self.capture.frame(c, frame), self.shrink) for c in self.capture.cameras]
+
+
+@dataclass(frozen=True)
+class _LearnReduced:
+    """Background model of one camera in reduced images."""
+
+    capture: Capture
+    settings: SilhouetteSettings
+    shrink: int
+
+    def __call__(self, camera: str) -> BackgroundModel:
+        recorded = self.capture.sources[camera]
+        count = min(self.settings.samples, len(recorded))
+        chosen = np.unique(np.linspace(0, len(recorded) - 1, count).round().astype(int))
+        frames = [_reduced(recorded.read(int(k)), self.shrink) for k in chosen]
+        if not self.capture.has_background(camera):
+            return model_from_frames(frames, self.settings, camera)
+        plate = _reduced(self.capture.background(camera), self.shrink)
+        plate[..., 3] = np.where(plate[..., 3] == 255, 255, 0)  # a pixel is known if all that it covers is
+        return model_from_plate(plate, frames, self.settings, camera)
+
+
+@dataclass(frozen=True)
+class _CutReduced:
+    """Silhouettes of one frame's reduced images."""
+
+    read: _ReadReduced
+    scene: SilhouetteScene
+
+    def __call__(self, frame: int) -> tuple[np.ndarray, ...]:
+        return self.scene.silhouettes(self.read(frame))
