@@ -69,6 +69,8 @@ def main(number: int = 100, seed: int = 0) -> int:
             bad += bool(wrong)
             if wrong:
                 print(f"{k}: {where}: {'; '.join(wrong[:5])}", file=told, flush=True)
+            elif k % 10 == 9:
+                print(f"{k + 1} killed", file=told, flush=True)
             shutil.rmtree(run)
     found = ", ".join(f"{n} {place}" for place, n in places.most_common())
     print(f"{len(whole)} files, {seconds:.1f} s; {number} killed, {bad} of them wrong; {found}", file=told)
