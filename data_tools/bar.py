@@ -14,6 +14,7 @@ from data_tools.camera_views import DistortedView
 from data_tools.image_rendering import Stage, expose
 from geomocap.errors import CalibrationError
 from geomocap.files.atomic import write_atomic, write_text
+from geomocap.files.images import write_image
 from geomocap.model.rig import Rig
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items
@@ -109,12 +110,7 @@ def record_bar(
     def make(p: int) -> None:
         for c, name in enumerate(rig.names):
             image = picture_bar(stages[c].background, stages[c].view, rig, c, bar.targets[p], bar.radius)
-            picture = cv2.cvtColor(expose(image, gains[c], noise, (seed, 5, c, p)), cv2.COLOR_RGB2BGR)
-
-            def write(path: Path, picture: np.ndarray = picture) -> bool:
-                return cv2.imwrite(str(path), picture)
-
-            write_atomic(capture / "bar" / name / f"{p:06d}.png", write)
+            write_image(capture / "bar" / name / f"{p:06d}.png", expose(image, gains[c], noise, (seed, 5, c, p)))
 
     for _ in map_items(make, range(len(bar.targets)), executor, "bar", progress, ahead=4):
         pass

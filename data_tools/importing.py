@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -15,7 +14,7 @@ from data_tools.image_sizes import SizeMismatch, find_fit, refit_camera
 from data_tools.plates import compose_plate
 from data_tools.synthesize import write_png
 from geomocap.errors import CalibrationError, CaptureError, GeomocapError
-from geomocap.files.atomic import write_atomic
+from geomocap.files.atomic import copy_whole
 from geomocap.files.capture import Capture, CaptureInfo, write_capture_info
 from geomocap.files.images import IMAGE_ENDINGS, check_image, read_image
 from geomocap.files.rigs import read_rig, write_rig
@@ -106,7 +105,7 @@ def import_pose2sim(
             )
         cameras.append(camera)
         target = capture / "videos" / f"{name}{file.suffix.lower()}"
-        write_atomic(target, lambda p, file=file: shutil.copyfile(file, p))  # type: ignore[misc]
+        copy_whole(file, target)
     progress("videos", len(files), len(files))
     rig = Rig(rig.names, tuple(cameras), np.array(rig.cam_from_world), rig.notes)
     notes += rig.notes
@@ -169,7 +168,7 @@ def import_colmap(
         for t, file in enumerate(files):
             target = capture / "images" / name / f"{t:06d}{file.suffix.lower()}"
             if file.suffix.lower() in IMAGE_ENDINGS:
-                write_atomic(target, lambda p, file=file: shutil.copyfile(file, p))  # type: ignore[misc]
+                copy_whole(file, target)
             else:  # other formats are stored anew, without loss
                 write_png(target.with_suffix(".png"), read_image(file))
     progress("images", len(rig), len(rig))

@@ -7,7 +7,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from pydantic import Field
 
@@ -22,7 +21,7 @@ from data_tools.video_writing import VideoFile
 from geomocap.errors import CaptureError
 from geomocap.files.atomic import write_atomic
 from geomocap.files.capture import CaptureInfo, write_capture_info
-from geomocap.files.images import MOST_SIDE
+from geomocap.files.images import MOST_SIDE, write_image
 from geomocap.files.rigs import write_rig
 from geomocap.model.rig import Rig
 from geomocap.progress import Progress, silent
@@ -301,6 +300,4 @@ def write_truth(
 
 def write_png(path: Path, image: np.ndarray) -> None:
     """Write an image (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) grey, uint8, with OpenCV's fast default compression."""
-    if image.ndim == 3:
-        image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
-    write_atomic(path, lambda p: cv2.imwrite(str(p), image))
+    write_image(path, image)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import av
 import numpy as np
 
 from geomocap.errors import RunError
+from geomocap.files.atomic import temporary_beside
+from geomocap.files.whole_files import is_whole_mp4
 
 
 class VideoFile:
@@ -31,7 +34,7 @@ class VideoFile:
         if width % 2 or height % 2:
             raise RunError(f"{path}: {width}×{height} can't be written as H.264; choose even numbers of pixels")
         self.path = path
-        self._temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
+        self._temporary = temporary_beside(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._container = av.open(str(self._temporary), "w")
@@ -56,6 +59,8 @@ class VideoFile:
         try:
             self._container.mux(self._stream.encode())
             self._container.close()
+            if not is_whole_mp4(self._temporary):
+                raise OSError(None, "it was not written whole")
             os.replace(self._temporary, self.path)
         except OSError as error:
             raise RunError(f"{self.path}: can't be written ({error.strerror}); free space") from None
@@ -63,5 +68,6 @@ class VideoFile:
     def close(self) -> None:
         """Drop the file if it was not finished."""
         if self._temporary.exists():
-            self._container.close()
+            with suppress(OSError):  # what is still under way has no room either
+                self._container.close()
             self._temporary.unlink(missing_ok=True)

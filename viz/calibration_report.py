@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from geomocap.calibration.bar_calibration import Calibration
-from geomocap.files.atomic import write_atomic
+from geomocap.files.atomic import write_bytes
 from viz.body_colors import ACCENT, INK, body_color, hex_color
 from viz.figures import plot
 from viz.report import Block, Report, Section, table, text, write_report
@@ -39,7 +39,7 @@ def write_calibration_report(calibration: Calibration, folder: Path) -> Path:
         "lengths": held_out_lengths(calibration),
     }
     for name, png in plots.items():
-        write_atomic(folder / f"{name}.png", lambda p, png=png: p.write_bytes(png))  # type: ignore[misc]
+        write_bytes(folder / f"{name}.png", png)
     page = folder / "report.html"
     write_report(page, report_of(calibration, plots))
     return page

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geomocap.files.atomic import write_atomic
+from geomocap.files.atomic import write_bytes
 from geomocap.progress import Progress
 from viz.drawing import write_png
 from viz.report import Block, picture, plot
@@ -42,6 +42,6 @@ class Desk:
         """Write a plot and return its block."""
         self.step()
         path = self.folder / f"{name}.png"
-        write_atomic(path, lambda p: p.write_bytes(png))
+        write_bytes(path, png)
         self.written.append(path)
         return [plot(png, heading, words)]

@@ -12,7 +12,7 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from geomocap.files.atomic import write_atomic
+from geomocap.files.atomic import write_bytes
 from viz.body_colors import INK
 
 FAINT = (118, 124, 133)
@@ -175,7 +175,9 @@ def sheet(
 
 def write_png(path: Path, image: np.ndarray) -> None:
     """Write an image (H, W, 3) uint8 RGB as PNG, whole or not at all."""
-    write_atomic(path, lambda p: Image.fromarray(image).save(p, optimize=False, compress_level=4))
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG", optimize=False, compress_level=4)
+    write_bytes(path, buffer.getbuffer())
 
 
 def jpeg(image: np.ndarray, quality: int = 88) -> bytes:

@@ -12,6 +12,7 @@ import numpy as np
 
 from geomocap.errors import RunError
 from geomocap.files.atomic import write_atomic
+from geomocap.files.whole_files import is_whole_mp4
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads
 from viz import scene
@@ -59,7 +60,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, quality: i
             if container is not None:
                 container.close()
 
-    write_atomic(path, write)
+    write_atomic(path, write, is_whole_mp4)
 
 
 def best_camera(results: Results, stage: ViewStage) -> str | None:

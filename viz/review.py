@@ -26,6 +26,7 @@ from viz.scene import stage as find_stage
 from viz.sections import (
     bodies_table,
     cameras_table,
+    changed_files,
     figures_of_quality,
     key_figures,
     lead,
@@ -104,7 +105,10 @@ def review(
     quality = assess(results, chosen)
     desk.step()
     parts = [
-        section("Result", [*verdict(results), *summary(quality), *_result(results, stage, chosen, desk)]),
+        section(
+            "Result",
+            [*changed_files(results), *verdict(results), *summary(quality), *_result(results, stage, chosen, desk)],
+        ),
         section("What went in", _inputs(results, stage, chosen, desk)),
         section("Silhouettes", _silhouettes(results, quality, chosen, desk)),
         section("Volume and points", _volume(results, stage, chosen, desk)),

@@ -128,6 +128,16 @@ def verdict(results: Results) -> list[Block]:
     return [Block("fine", f"{words} Model, cameras and paths agree.")]
 
 
+def changed_files(results: Results) -> list[Block]:
+    """Return which files that the report shows are no longer as the run wrote them."""
+    faults = {name: fault for name, fault in results.run.faults().items() if not name.startswith("review/")}
+    if not faults:
+        return []
+    return [
+        Block("warnings", items=("Start the run again:", *(f"{name} is {fault}." for name, fault in faults.items())))
+    ]
+
+
 def agreement_table(results: Results) -> list[Block]:
     """Return how well the model and the other cameras explain what each camera saw."""
     found = read_self_check(results.run)

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.calibration_files.plausibility import check_rig, in_metres
-from geomocap.errors import RunError
-from geomocap.files.rigs import colmap_model, read_rig
+from geomocap.files.rigs import read_rig, write_rig
 from geomocap.model.rig import Rig
 
 
@@ -45,12 +44,4 @@ def write_colmap(rig: Rig, folder: Path, *, binary: bool = False) -> None:
     RunError
         If the folder can't be written.
     """
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if binary:
-            colmap_model(rig).write_binary(str(folder))
-        else:
-            colmap_model(rig).write_text(str(folder))
-    except OSError as error:
-        raise RunError(f"{folder}: can't be written ({error.strerror or error})") from None
+    write_rig(Path(folder), rig, binary=binary)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,8 +31,8 @@ from geomocap.calibration.stability import Moved, moved_of
 from geomocap.calibration.target_observations import TargetObservations
 from geomocap.calibration.verdict import Verdict, judge
 from geomocap.calibration.world import WorldKnowledge
-from geomocap.errors import CalibrationError, RunError
-from geomocap.files.rigs import colmap_model
+from geomocap.errors import CalibrationError
+from geomocap.files.rigs import colmap_model, write_model
 from geomocap.model.rig import Rig
 from geomocap.progress import Progress, silent
 
@@ -162,24 +161,7 @@ class Calibration:
         """
         sparse = Path(sparse)
         check_replaceable(sparse, force)
-        temporary = sparse.with_name(f".{sparse.name}.tmp")
-        old = sparse.with_name(f".{sparse.name}.old")
-        try:
-            for folder in (temporary, old):
-                shutil.rmtree(folder, ignore_errors=True)
-            temporary.mkdir(parents=True)
-            self.reconstruction().write_text(str(temporary))
-            (temporary / MARK).write_text(json.dumps(self.record(), indent=1), encoding="utf-8")
-            if sparse.exists():
-                sparse.rename(old)
-            temporary.rename(sparse)
-        except OSError as error:
-            if not sparse.exists() and old.exists():
-                old.rename(sparse)
-            raise RunError(f"{sparse}: can't be written ({error.strerror or error})") from None
-        finally:
-            for folder in (temporary, old):
-                shutil.rmtree(folder, ignore_errors=True)
+        write_model(sparse, self.reconstruction(), beside={MARK: json.dumps(self.record(), indent=1)})
 
 
 def check_replaceable(sparse: Path, force: bool) -> None:

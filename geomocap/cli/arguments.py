@@ -25,6 +25,7 @@ ModelFile = Annotated[
         "--model", metavar="FILE.npz", help="Model of the subject, model.npz of another run: it is followed instead."
     ),
 ]
+Wait = Annotated[bool, typer.Option("--wait", help="If another process works in RUN, wait until it has ended.")]
 Pictures = Annotated[bool, typer.Option(help="Make review pictures and the report.")]
 Workers = Annotated[
     int | None,

@@ -12,7 +12,7 @@ from rich.table import Table
 from geomocap.cli.arguments import Workers
 from geomocap.cli.console import console
 from geomocap.cli.progress_bars import progress_bars
-from geomocap.cli.reports import capture_of
+from geomocap.cli.reports import capture_of, tell_faults
 from geomocap.cli.settings_options import with_options_of
 from geomocap.errors import RunError
 from geomocap.evaluation.evaluation_settings import EvaluationSettings
@@ -60,6 +60,7 @@ def evaluate(
 
     Example: `geomocap evaluate RUN walk.c3d --align true --find_offset true --report evaluation.html`
     """
+    tell_faults(Run(run))
     if truth is None:
         _without_truth(run, json_file)
         return

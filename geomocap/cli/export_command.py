@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from geomocap.cli.arguments import Workers
+from geomocap.cli.arguments import Wait, Workers
 from geomocap.cli.console import console
 from geomocap.cli.progress_bars import progress_bars
+from geomocap.cli.reports import existing_run, tell_faults, working
 from geomocap.cli.settings_options import with_settings
 from geomocap.config import Config
 from geomocap.export.names import Names
 from geomocap.export.run_export import Exported, export_run
 from geomocap.files.result_schemas import skeleton_gaps
 from geomocap.files.results import read_skeleton
-from geomocap.files.run import Run
 
 
 @with_settings("export")
@@ -39,6 +40,7 @@ def export(
         Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; RUN if not given.")
     ] = None,
     workers: Workers = None,
+    wait: Wait = False,
 ) -> None:
     """Write motion files of a run for Blender, OpenSim, C3D tools, game engines and plots.
 
@@ -51,12 +53,16 @@ def export(
     settings = config.export
     if with_skin:
         settings = settings.model_copy(update={"surface": "skin"})
-    with progress_bars() as progress:
+    opened = existing_run(run)
+    with working(run, wait) if out is None else nullcontext(), progress_bars() as progress:
+        tell_faults(opened)
         exported = export_run(
-            Run(run), formats, settings, names=Names.read(names) if names else None, folder=out, progress=progress
+            opened, formats, settings, names=Names.read(names) if names else None, folder=out, progress=progress
         )
+        if out is None:
+            opened.renew("export", exported.files.values())
     report_exported(exported)
-    for gap in skeleton_gaps(read_skeleton(Run(run))):
+    for gap in skeleton_gaps(read_skeleton(opened)):
         console.print(f"note: {gap}")
 
 

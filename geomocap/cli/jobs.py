@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 from geomocap.cli.console import console
 from geomocap.cli.execution import executor_for
 from geomocap.cli.progress_bars import progress_bars
+from geomocap.cli.reports import tell_note, working
 from geomocap.config import Config
 from geomocap.errors import GeomocapError, RunError
 from geomocap.files.capture import Capture
@@ -17,10 +19,19 @@ from geomocap.files.scans import open_scans
 from geomocap.pipeline.job import Job
 from geomocap.subject.subject_model import MODEL_FILE, read_model
 
+CAPTURE_FOLDERS = ("images", "videos", "background", "masks", "sparse", "bar")  # of a capture
+
 
 @contextmanager
 def capture_job(
-    capture: Path, run: Path, config: Config, workers: int | None, scheduler: str | None, model: Path | None = None
+    capture: Path,
+    run: Path,
+    config: Config,
+    workers: int | None,
+    scheduler: str | None,
+    model: Path | None = None,
+    *,
+    wait: bool = False,
 ) -> Iterator[Job]:
     """Make the job of a capture, with the subject's model if there is one."""
     opened = Capture.open(capture)
@@ -29,8 +40,8 @@ def capture_job(
     with suppress(GeomocapError):  # what is wrong with the cameras, the stages that need them say
         for note in opened.rig.notes:
             console.print(f"note: {note}")
-    with executor_for(workers, scheduler) as executor, progress_bars() as progress:
-        yield Job(Run(run), config, executor, progress, capture=opened, fps=opened.fps, model=model)
+    with working(run, wait), executor_for(workers, scheduler) as executor, progress_bars() as progress:
+        yield Job(Run(run), config, executor, progress, capture=opened, fps=opened.fps, model=model, tell=tell_note)
 
 
 @contextmanager
@@ -42,13 +53,15 @@ def scans_job(
     workers: int | None,
     scheduler: str | None,
     model: Path | None = None,
+    *,
+    wait: bool = False,
 ) -> Iterator[Job]:
     """Make the job of a sequence of scans, with the subject's model if there is one."""
     opened = open_scans(scans, config.scans)
     _check_apart(scans, run)
     _check_model(model, run)
-    with executor_for(workers, scheduler) as executor, progress_bars() as progress:
-        yield Job(Run(run), config, executor, progress, scans=opened, fps=fps, model=model)
+    with working(run, wait), executor_for(workers, scheduler) as executor, progress_bars() as progress:
+        yield Job(Run(run), config, executor, progress, scans=opened, fps=fps, model=model, tell=tell_note)
 
 
 def _check_model(model: Path | None, run: Path) -> None:
@@ -62,5 +75,9 @@ def _check_model(model: Path | None, run: Path) -> None:
 
 def _check_apart(source: Path, run: Path) -> None:
     """A run must not write into what it reads."""
-    if run.resolve() == source.resolve() or run.resolve() in source.resolve().parents:
+    source, place = Path(os.path.realpath(source)), Path(os.path.realpath(run))
+    if place == source or place in source.parents:
         raise RunError(f"{run}: holds the input {source}; choose another folder for the run")
+    for part in CAPTURE_FOLDERS:
+        if place.is_relative_to(source / part):
+            raise RunError(f"{run}: is inside {source / part}, which is part of the input; choose another folder")

@@ -9,10 +9,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from geomocap.cli.arguments import ExistingRun, Workers
+from geomocap.cli.arguments import ExistingRun, Wait, Workers
 from geomocap.cli.console import console
 from geomocap.cli.export_command import report_exported
-from geomocap.cli.reports import capture_of
+from geomocap.cli.reports import capture_of, existing_run, tell_faults, working
 from geomocap.cli.settings_options import with_file_of_options
 from geomocap.errors import GeomocapError
 from geomocap.export.run_export import export_run
@@ -41,6 +41,7 @@ def keypoints(
         int, typer.Option("--port", min=1, max=65535, help="Port of the page; the next free one if it is taken.")
     ] = 8080,
     workers: Workers = None,
+    wait: Wait = False,
 ) -> None:
     """Follow key-points on the surface, given as `[[keypoint]]` tables: name, center (m), radius (m), frame.
 
@@ -50,14 +51,17 @@ def keypoints(
     With `--edit` the key-points are placed on the surface in the browser and saved as such a file.
     """
     file = points or run / "keypoints.toml"
+    opened = existing_run(run)
+    tell_faults(opened)
     if edit:
-        _edit(Run(run), file, host, port)
-    else:
-        wanted = read_keypoints(file)
-        _report(Run(run), wanted, follow_keypoints(Run(run), wanted))
+        _edit(opened, file, host, port, wait)
+        return
+    wanted = read_keypoints(file)
+    with working(run, wait):
+        _report(opened, wanted, follow_keypoints(opened, wanted))
 
 
-def _edit(run: Run, file: Path, host: str, port: int) -> None:
+def _edit(run: Run, file: Path, host: str, port: int, wait: bool) -> None:
     """Serve the editor until the user interrupts it; save when asked to."""
     from viz.keypoint_editor import KeyPointEditor
     from viz.keypoint_scene import Subject
@@ -69,6 +73,10 @@ def _edit(run: Run, file: Path, host: str, port: int) -> None:
     subject = Subject(Results(run, capture_of(run)), tracks.positions, run_fps(run))
 
     def save(wanted: KeyPointFile) -> str:
+        with working(run.path, wait):  # not all the time that the page is open
+            return save_alone(wanted)
+
+    def save_alone(wanted: KeyPointFile) -> str:
         write_keypoints(file, wanted)
         if not wanted.keypoint:
             clear_results(run)
@@ -106,4 +114,6 @@ def _report(run: Run, file: KeyPointFile, found: FollowedKeyPoints) -> None:
     for reason in found.skipped:
         console.print(f"not written: {reason}", markup=False)
     if run.has(SKELETON):
-        report_exported(export_run(run))
+        exported = export_run(run)
+        run.renew("export", exported.files.values())
+        report_exported(exported)

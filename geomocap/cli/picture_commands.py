@@ -7,20 +7,21 @@ from typing import Annotated, Literal
 
 import typer
 
-from geomocap.cli.arguments import ExistingRun, Workers
+from geomocap.cli.arguments import ExistingRun, Wait, Workers
 from geomocap.cli.console import console
 from geomocap.cli.progress_bars import progress_bars
-from geomocap.cli.reports import capture_of, review_run, tell_results
+from geomocap.cli.reports import capture_of, existing_run, review_run, tell_faults, tell_results, working
 from geomocap.cli.settings_options import with_file_of_options
-from geomocap.files.run import Run
 from viz.picture_files import render_file
 
 
 @with_file_of_options
-def review(run: ExistingRun, workers: Workers = None) -> None:
+def review(run: ExistingRun, workers: Workers = None, wait: Wait = False) -> None:
     """Make the pictures and the report of a run anew, from its files."""
-    with progress_bars() as progress:
-        review_run(Run(run), capture_of(Run(run)), progress)
+    opened = existing_run(run)
+    with working(run, wait), progress_bars() as progress:
+        tell_faults(opened)
+        opened.renew("review", review_run(opened, capture_of(opened), progress))
     tell_results(run)
 
 

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
 from geomocap.cli.console import console
-from geomocap.errors import GeomocapError
+from geomocap.errors import GeomocapError, RunError
 from geomocap.files.atomic import fingerprint
 from geomocap.files.capture import Capture
 from geomocap.files.results import read_cloud_record, read_warnings
 from geomocap.files.run import Run, stage_key
+from geomocap.files.run_lock import working_in
+from geomocap.files.stage_records import listed_faults
 from geomocap.pipeline.cloud_stage import measure_again
 from geomocap.pipeline.job import Job
 from geomocap.progress import Progress, silent
@@ -27,12 +32,50 @@ def review_job(job: Job, made_from: str) -> None:
     """
     templates = fingerprint([Path(review.__code__.co_filename).parent / "templates"])
     key = stage_key(review.__module__, "review", made_from, job.up, templates, sorted(job.run.read_timings()))
-    job.stage("review", key, ["review"], lambda: len(review_run(job.run, job.capture, job.progress)))
+
+    def work() -> int:
+        written = review_run(job.run, job.capture, job.progress)
+        job.run.note("review", written)
+        return len(written)
+
+    job.stage("review", key, ["review"], work)
 
 
 def review_run(run: Run, capture: Capture | None, progress: Progress = silent) -> list[Path]:
     """Make pictures and report of a run, with a frame's surface measured again where it was measured."""
     return review(run, capture, measured=partial(measure_again, run, capture), progress=progress)
+
+
+@contextmanager
+def working(run: Path, wait: bool) -> Iterator[None]:
+    """Keep other processes out of a run while this command writes into it."""
+    with working_in(Run(run), " ".join(sys.argv[1:2]), wait=wait, tell=tell_note):
+        yield
+
+
+def existing_run(path: Path) -> Run:
+    """Return the run of a folder that is there.
+
+    Raises
+    ------
+    RunError
+        If there is none.
+    """
+    if not path.is_dir():
+        raise RunError(f"{path}: no run folder; make one with `geomocap run` or `geomocap segment`")
+    return Run(path)
+
+
+def tell_note(text: str) -> None:
+    """Print what the user should know."""
+    console.print(f"note: {text}", markup=False)
+
+
+def tell_faults(run: Run) -> None:
+    """Warn of files that are no longer as the run wrote them."""
+    faults = run.faults()
+    if faults:
+        console.print(f"warning: {listed_faults(faults)}; start the run again and it is made again", markup=False)
 
 
 def capture_of(run: Run) -> Capture | None:
@@ -43,7 +86,7 @@ def capture_of(run: Run) -> Capture | None:
     try:
         return Capture.open(Path(source["path"]))
     except GeomocapError as error:
-        console.print(f"note: the capture can't be shown ({error})")
+        tell_note(f"the capture can't be shown ({error})")
         return None
 
 
@@ -53,7 +96,7 @@ def tell_results(run: Path) -> None:
         console.print(f"warning: {warning}")
     for what, file in (("motion", "motion.bvh"), ("report", "review/report.html")):
         if (run / file).exists():
-            console.print(f"{what}: {run / file}")
+            console.print(f"{what}: {run / file}", markup=False)
 
 
 def tell_clouds(run: Run) -> None:

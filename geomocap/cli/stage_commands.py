@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from geomocap.cli.arguments import CaptureFolder, ModelFile, Pictures, RunFolder, Scheduler, Workers
+from geomocap.cli.arguments import CaptureFolder, ModelFile, Pictures, RunFolder, Scheduler, Wait, Workers
 from geomocap.cli.settings_options import with_settings
 from geomocap.config import Config
 from geomocap.settings import LEAST_FPS, MOST_FPS
@@ -21,51 +21,71 @@ BODIES = ("segmentation", "skeleton", "nodes", "motion_bodies", "motion_skeleton
 
 @with_settings("silhouettes")
 def silhouettes(
-    capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
+    capture: CaptureFolder,
+    run: RunFolder,
+    config: Config,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    wait: Wait = False,
 ) -> None:
     """Cut the subject out of all images."""
     from geomocap import pipeline
     from geomocap.cli.jobs import capture_job
 
-    with capture_job(capture, run, config, workers, scheduler) as job:
+    with capture_job(capture, run, config, workers, scheduler, wait=wait) as job:
         pipeline.silhouettes(job)
 
 
 @with_settings("silhouettes", "carving")
 def voxels(
-    capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
+    capture: CaptureFolder,
+    run: RunFolder,
+    config: Config,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    wait: Wait = False,
 ) -> None:
     """Carve the surface voxels of all frames, silhouettes first where they are missing."""
     from geomocap import pipeline
     from geomocap.cli.jobs import capture_job
 
-    with capture_job(capture, run, config, workers, scheduler) as job:
+    with capture_job(capture, run, config, workers, scheduler, wait=wait) as job:
         pipeline.voxels(job)
 
 
 @with_settings("silhouettes", "carving", "cloud")
 def cloud(
-    capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
+    capture: CaptureFolder,
+    run: RunFolder,
+    config: Config,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    wait: Wait = False,
 ) -> None:
     """Measure the surface by least squares matching: a dense point cloud for each frame."""
     from geomocap import pipeline
     from geomocap.cli.jobs import capture_job
     from geomocap.cli.reports import tell_clouds
 
-    with capture_job(capture, run, config, workers, scheduler) as job:
+    with capture_job(capture, run, config, workers, scheduler, wait=wait) as job:
         pipeline.clouds(job)
     tell_clouds(job.run)
 
 
 @with_settings("silhouettes", "carving", "tracking", "filters", "smoothing")
 def track(
-    capture: CaptureFolder, run: RunFolder, config: Config, workers: Workers = None, scheduler: Scheduler = None
+    capture: CaptureFolder,
+    run: RunFolder,
+    config: Config,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    wait: Wait = False,
 ) -> None:
     """Follow points of the surface through all frames: trajectories with velocities and accelerations."""
     from geomocap import pipeline
     from geomocap.cli.jobs import capture_job
 
-    with capture_job(capture, run, config, workers, scheduler) as job:
+    with capture_job(capture, run, config, workers, scheduler, wait=wait) as job:
         pipeline.tracks(job)
 
 
@@ -81,13 +101,14 @@ def segment(
     pictures: Pictures = True,
     workers: Workers = None,
     scheduler: Scheduler = None,
+    wait: Wait = False,
 ) -> None:
     """Segment any sequence of scans into rigid bodies, joints and motion; one scan gets its ellipsoids."""
     from geomocap import pipeline
     from geomocap.cli.jobs import scans_job
     from geomocap.cli.reports import review_job, tell_results
 
-    with scans_job(scans, run, fps, config, workers, scheduler, model) as job:
+    with scans_job(scans, run, fps, config, workers, scheduler, model, wait=wait) as job:
         key = pipeline.motion_files(job, "scans")
         if pictures:
             review_job(job, key)
@@ -104,6 +125,7 @@ def run(
     pictures: Pictures = True,
     workers: Workers = None,
     scheduler: Scheduler = None,
+    wait: Wait = False,
 ) -> None:
     """Do everything: from a capture to bodies, skeleton, motion files and report.
 
@@ -118,7 +140,7 @@ def run(
     from geomocap.cli.jobs import capture_job
     from geomocap.cli.reports import review_job, tell_clouds, tell_results
 
-    with capture_job(capture, run, config, workers, scheduler, model) as job:
+    with capture_job(capture, run, config, workers, scheduler, model, wait=wait) as job:
         key = pipeline.motion_files(job, source)
         if pictures:
             review_job(job, key)

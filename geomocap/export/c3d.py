@@ -20,6 +20,7 @@ from geomocap.files.atomic import write_atomic
 from geomocap.version import __version__
 
 FINEST_RESIDUAL = 0.01  # mm; residuals are bytes, multiples of POINT:SCALE
+_BLOCK = 512  # bytes
 LABELS_PER_PARAMETER = 255  # a dimension of a C3D parameter is a byte
 
 
@@ -66,7 +67,16 @@ def write_c3d(path: Path, markers: Markers, motion: MotionTree | None = None) ->
         file["data"]["rotations"] = _transforms(motion)
         _add_texts(file, "ROTATION", "LABELS", motion.names)
         file.add_parameter("ROTATION", "DESCRIPTIONS", ["world from body since the first frame, mm"] * motion.n_nodes)
-    write_atomic(path, lambda p: file.write(str(p)))
+    write_atomic(path, lambda p: file.write(str(p)), lambda p: _is_whole(p, markers, motion))
+
+
+def _is_whole(path: Path, markers: Markers, motion: MotionTree | None) -> bool:
+    """Whether a C3D holds its points and, from the next block on, its rotations; ezc3d tells of no full disk."""
+    data = path.read_bytes()
+    first = int.from_bytes(data[16:18], "little") - 1  # blocks before the points
+    points = 4 * 4 * len(markers.names) * markers.n_frames  # bytes
+    rotations = 0 if motion is None else 17 * 4 * motion.n_nodes * motion.n_frames
+    return first > 0 and len(data) >= _BLOCK * (first + -(-points // _BLOCK)) + rotations
 
 
 def _add_texts(file: dict, group: str, name: str, texts: tuple[str, ...]) -> None:

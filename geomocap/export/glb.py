@@ -15,7 +15,7 @@ import pygltflib as gltf
 from geomocap.export.conventions import GLB
 from geomocap.export.motion_tree import MotionTree
 from geomocap.export.skinned_mesh import SkinnedMesh, bone_mesh
-from geomocap.files.atomic import write_atomic
+from geomocap.files.atomic import write_bytes
 from geomocap.model.rotations import quaternions
 
 _COMPONENT = {np.dtype(np.float32): gltf.FLOAT, np.dtype(np.uint16): gltf.UNSIGNED_SHORT}
@@ -37,7 +37,7 @@ def write_glb(path: Path, motion: MotionTree, mesh: SkinnedMesh | None = None, *
         Name of the animation.
     """
     data = glb_bytes(motion, mesh or bone_mesh(motion), name)
-    write_atomic(path, lambda p: p.write_bytes(data))
+    write_bytes(path, data)
 
 
 def glb_bytes(motion: MotionTree, mesh: SkinnedMesh, name: str = "motion") -> bytes:

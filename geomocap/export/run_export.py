@@ -25,6 +25,7 @@ from geomocap.export.skinned_mesh import SkinnedMesh
 from geomocap.export.tables import motion_table, write_csv, write_parquet
 from geomocap.export.trc import write_trc
 from geomocap.export.usd import write_usd
+from geomocap.files.atomic import remove_remains
 from geomocap.files.results import ELLIPSOIDS, KEYPOINTS, read_ellipsoids, read_keypoint_paths, read_skeleton
 from geomocap.files.run import Run
 from geomocap.model.skeleton import Skeleton
@@ -110,6 +111,7 @@ def export_run(
     markers = run_markers(run, skeleton, names, up, ellipsoids=settings.ellipsoids)
     mesh = surface_of_run(run, motion, settings)
     writers = _writers(motion, markers, mesh, settings)
+    remove_remains([folder or run.path])
     files, skipped = {}, {}
     chosen = list(formats) if formats is not None else list(FILES)
     for k, name in enumerate(chosen):

@@ -62,4 +62,4 @@ def read_cloud_record(run: Run) -> CloudRecord | None:
 def write_cloud_record(run: Run, frame: int, points: int, reasons: Mapping[str, int], warnings: Sequence[str]) -> None:
     """Write of a frame how many points were measured, why others were not, and what looks wrong."""
     record = {"points": points, "reasons": dict(reasons), "warnings": list(warnings)}
-    write_text(run.path / "cloud" / f"{frame:06d}.json", json.dumps(record, indent=1))
+    write_text(run.path / "cloud" / f"{frame:06d}.json", json.dumps(record, indent=1), lasting=False)

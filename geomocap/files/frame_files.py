@@ -11,7 +11,8 @@ import open3d as o3d
 from geomocap.errors import GeometryError
 from geomocap.files.atomic import write_atomic
 from geomocap.files.geometry_claims import check_geometry
-from geomocap.files.open3d_geometry import check_ply, read_by_open3d
+from geomocap.files.open3d_geometry import check_ply, read_by_open3d, write_by_open3d
+from geomocap.files.whole_files import is_whole_ply
 from geomocap.model.frame_geometry import BodyPoints, Voxels
 from geomocap.reading import open_plain, read_bytes
 
@@ -19,7 +20,12 @@ from geomocap.reading import open_plain, read_bytes
 def write_voxels(path: Path, voxels: Voxels) -> None:
     """Write voxels as the PLY of an Open3D voxel grid, whole or not at all."""
     grid = voxels.to_open3d()
-    write_atomic(path, lambda p: o3d.io.write_voxel_grid(p, grid))
+    write_atomic(
+        path,
+        write_by_open3d(o3d.io.write_voxel_grid, grid, _VOXEL.itemsize * len(voxels.indices)),
+        is_whole_ply,
+        lasting=False,
+    )
 
 
 def read_voxels(path: Path) -> Voxels:
@@ -46,7 +52,8 @@ def read_voxels(path: Path) -> Voxels:
 def write_points(path: Path, points: BodyPoints | o3d.t.geometry.PointCloud) -> None:
     """Write points with their bodies, or any tensor point cloud, as PLY, whole or not at all."""
     cloud = points.to_open3d() if isinstance(points, BodyPoints) else points
-    write_atomic(path, lambda p: o3d.t.io.write_point_cloud(p, cloud))
+    size = sum(tensor.numpy().nbytes for _, tensor in cloud.point.items())
+    write_atomic(path, write_by_open3d(o3d.t.io.write_point_cloud, cloud, size), is_whole_ply, lasting=False)
 
 
 def read_points(path: Path) -> BodyPoints:

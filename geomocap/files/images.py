@@ -6,6 +6,7 @@ Pictures have eight bits a value here. Those of 16 are scaled by the bits that a
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +15,7 @@ import cv2
 import numpy as np
 
 from geomocap.errors import CaptureError
+from geomocap.files.atomic import write_bytes
 from geomocap.files.image_formats import MOST_PIXELS, ImageHeader, image_flaw, image_header
 from geomocap.reading import open_plain, read_bytes
 
@@ -48,6 +50,27 @@ def read_image(path: Path, *, gray: bool = False, alpha: bool = False, bits: int
     channels = image.shape[2] if image.ndim == 3 else 1
     conversion = {1: cv2.COLOR_GRAY2RGBA, 4: cv2.COLOR_BGRA2RGBA}.get(channels, cv2.COLOR_BGR2RGBA)
     return cv2.cvtColor(image, conversion)
+
+
+def write_image(path: Path, image: np.ndarray, parameters: Sequence[int] = ()) -> None:
+    """Write an image (H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA, uint8, whole or not at all.
+
+    The ending says the format; `parameters` are OpenCV's. What OpenCV writes itself it doesn't check.
+
+    Raises
+    ------
+    RunError
+        If the file can't be written.
+    """
+    if image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
+    write_bytes(path, cv2.imencode(path.suffix, image, list(parameters))[1].data, lasting=False)
+
+
+def write_mask(path: Path, mask: np.ndarray) -> None:
+    """Write a silhouette (H, W) uint8 as a PNG that is made for speed, whole or not at all."""
+    fast = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
+    write_image(path, mask, fast)
 
 
 def image_size(path: Path) -> tuple[int, int]:

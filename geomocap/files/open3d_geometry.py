@@ -9,12 +9,13 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import open3d as o3d
 
 from geomocap.errors import GeometryError
+from geomocap.files.atomic import make_room
 from geomocap.reading import open_plain
 
 T = TypeVar("T")
@@ -26,6 +27,7 @@ _BYTES = {
     **dict.fromkeys(("double", "float64"), 8),
 }
 _HEADER_LIMIT = 1 << 16  # bytes
+_PLY_HEADER = 512  # bytes, about
 _alone = threading.Lock()  # the verbosity is one for all threads
 
 
@@ -41,6 +43,20 @@ def read_by_open3d(read: Callable[[Path], T], path: Path) -> T:
         check_ply(path)
     with _alone, o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         return read(path)
+
+
+def write_by_open3d(write: Callable[[Path, Any], bool], geometry: Any, size: int) -> Callable[[Path], bool]:
+    """Return what writes a geometry by one of Open3D's functions, which is silent then.
+
+    Where there is no room for `size` bytes it isn't called: it would go on, and its PLY library talk.
+    """
+
+    def silently(path: Path) -> bool:
+        make_room(path, size + _PLY_HEADER)
+        with _alone, o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            return write(path, geometry)
+
+    return silently
 
 
 @dataclass

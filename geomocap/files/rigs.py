@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from geomocap.errors import CalibrationError
+from geomocap.files.atomic import write_folder
 from geomocap.files.colmap_model import read_colmap_model
 from geomocap.model.orientations import NOTED
 from geomocap.model.rig import Rig
 from geomocap.reading import check_name
+
+MODEL_FILES = frozenset(
+    f"{name}.{ending}" for name in ("cameras", "frames", "images", "points3D", "rigs") for ending in ("bin", "txt")
+)
 
 
 def read_rig(sparse: Path, names: Sequence[str] | None = None) -> Rig:
@@ -70,7 +75,44 @@ def colmap_model(rig: Rig) -> pycolmap.Reconstruction:
     return model
 
 
-def write_rig(sparse: Path, rig: Rig) -> None:
-    """Write a rig as a COLMAP text model into the folder `sparse`, which is made if need be."""
-    sparse.mkdir(parents=True, exist_ok=True)
-    colmap_model(rig).write_text(str(sparse))
+def write_rig(sparse: Path, rig: Rig, *, binary: bool = False) -> None:
+    """Write a rig as a COLMAP model into the folder `sparse`, made if need be; see `write_model`."""
+    write_model(sparse, colmap_model(rig), binary=binary)
+
+
+def write_model(
+    sparse: Path, model: pycolmap.Reconstruction, *, binary: bool = False, beside: Mapping[str, str] | None = None
+) -> None:
+    """Put a COLMAP model in the place of the one in a folder, whole or not at all; other files there stay.
+
+    Parameters
+    ----------
+    sparse : Path
+    model : pycolmap.Reconstruction
+    binary : bool
+    beside : mapping of str to str, optional
+        Further files, name and text.
+
+    Raises
+    ------
+    RunError
+        If the folder can't be written.
+    """
+    texts = beside or {}
+
+    def write(folder: Path) -> None:
+        (model.write_binary if binary else model.write_text)(str(folder))
+        for name, text in texts.items():
+            (folder / name).write_text(text, encoding="utf-8")
+
+    def whole(folder: Path) -> bool:
+        if not binary and not all(f.read_bytes().endswith(b"\n") for f in folder.glob("*.txt")):
+            return False
+        try:
+            back = pycolmap.Reconstruction(str(folder))
+        except Exception:
+            return False
+        counts = [(m.num_cameras(), m.num_images(), m.num_points3D()) for m in (model, back)]
+        return counts[0] == counts[1]
+
+    write_folder(sparse, write, whole, MODEL_FILES)

@@ -1,21 +1,21 @@
 """A run: the output folder, written whole file by whole file, that knows which of its stages are up to date.
 
 Every stage has a key, the digest of all its inputs, its settings and the code that it uses. The keys are kept in
-`RUN/.stages/`. A stage whose key has changed is cleared before it writes; one whose key is the same goes on from the
-files that are there.
+`RUN/.stages/` with the files that each stage wrote (`stage_records`). A stage whose key has changed is cleared before
+it writes; one whose key is the same goes on from its files that are as it wrote them. What is cleared is what stages
+wrote, and numbered frames in their folders; files of anybody else stay.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 import threading
 import time
 import tomllib
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,32 @@ import numpy as np
 import tomli_w
 
 from geomocap.errors import RunError
-from geomocap.files.atomic import write_text
+from geomocap.files.atomic import links, write_text
 from geomocap.files.npz import read_npz, write_npz
+from geomocap.files.stage_records import (
+    FOLDER,
+    FileMark,
+    StageRecord,
+    add_to_journal,
+    forget_record,
+    read_record,
+    stages,
+    write_record,
+)
 from geomocap.source_digest import module_digest
 from geomocap.version import __version__
+
+_OWN = {  # folders of stages, and what is theirs there though no record says so
+    "silhouettes": "*/[0-9][0-9][0-9][0-9][0-9][0-9].png",
+    "voxels": "[0-9][0-9][0-9][0-9][0-9][0-9].ply",
+    "cloud": "[0-9][0-9][0-9][0-9][0-9][0-9].*",
+    "bodies": "[0-9][0-9][0-9][0-9][0-9][0-9].ply",
+    "review": "report.html",
+}
+_RESULTS = (  # as stages call them
+    *(f"{name}.npz" for name in ("diagnostics", "ellipsoids", "keypoints", "model", "skeleton", "tracks")),
+    *("motion.*", "check.json"),
+)
 
 
 def stage_key(module: str, *parts: Any) -> str:
@@ -92,7 +114,14 @@ class Run:
 
     # --- stages ---
 
-    def begin(self, stage: str, key: str, outputs: Sequence[str], optional: Sequence[str] = ()) -> None:
+    def begin(
+        self,
+        stage: str,
+        key: str,
+        outputs: Sequence[str],
+        optional: Sequence[str] = (),
+        derived: Sequence[str] = (),
+    ) -> dict[str, str]:
         """Open a stage for writing: if its key has changed, delete what it wrote before and what was made from that.
 
         Parameters
@@ -103,46 +132,123 @@ class Run:
         outputs : sequence of str
             Files and folders of the run that the stage always writes.
         optional : sequence of str
-            Those that it may write, or that others make from its outputs.
+            Those that it may write.
+        derived : sequence of str
+            Those that others make from its outputs.
+
+        Returns
+        -------
+        dict of str to str
+            Files that the stage wrote before and that are no longer as it wrote them, with what is wrong with each.
         """
-        if self._state(stage).get("key") == key:
-            return
+        for link in (link for name in (*outputs, *optional) for link in links(self.path / name, 2)):
+            raise RunError(f"{link}: is a link, a run writes into its own folder; remove it or choose another folder")
+        record = read_record(self.path, stage)
+        if record.key == key:
+            faults = record.faults(self.path)
+            if faults or record.done:
+                write_record(self.path, stage, replace(record.sound(self.path), done=False))
+            return faults
         try:
-            for name in (*outputs, *optional):
-                target = self.path / name
-                if target.is_dir():
-                    shutil.rmtree(target)
-                else:
-                    target.unlink(missing_ok=True)
+            (self.path / FOLDER / f"{stage}.journal").unlink(missing_ok=True)
+            self._clear(stage, (*outputs, *optional), derived)
         except OSError as error:
             raise RunError(f"{self.path}: old results of {stage} can't be deleted ({error.strerror})") from None
-        self._write_state(stage, {"key": key, "done": False, "outputs": list(outputs)})
+        write_record(self.path, stage, StageRecord(key, False, tuple(outputs)))
+        return {}
 
-    def finish(self, stage: str) -> None:
-        """Mark a stage as complete."""
-        self._write_state(stage, {**self._state(stage), "done": True})
+    def note(self, stage: str, files: Iterable[Path]) -> None:
+        """Note files that a stage under way has finished: when it is begun again, it goes on from them."""
+        add_to_journal(self.path, stage, files)
+
+    def sound(self, stage: str) -> set[Path]:
+        """Files of a stage that are as it wrote them."""
+        return {self.path / name for name in read_record(self.path, stage).sound(self.path).files}
+
+    def finish(self, stage: str, optional: Sequence[str] = ()) -> None:
+        """Mark a stage as complete, with its files: those noted, its outputs, and what is there of `optional`."""
+        record = read_record(self.path, stage).sound(self.path)
+        files = [self.path / name for name in (*record.outputs, *optional)]
+        self._write_files(stage, replace(record, done=True), files)
+
+    def renew(self, stage: str, files: Iterable[Path]) -> None:
+        """Take files of the run as those of a stage from now on: a command has written them."""
+        record = read_record(self.path, stage)
+        if not record.key:  # the stage itself will make them anew
+            record = StageRecord("made by a command", True)
+        self._write_files(stage, record, [f for f in files if f.is_relative_to(self.path)])
+
+    def forget(self, stage: str) -> None:
+        """Know nothing of a stage any more; its files stay."""
+        forget_record(self.path, stage)
 
     def is_done(self, stage: str, key: str) -> bool:
-        """Whether the stage is complete with this key and all its outputs are still there."""
-        state = self._state(stage)
-        if state.get("key") != key or not state.get("done"):
-            return False
-        return all((self.path / name).exists() for name in state["outputs"])
+        """Whether the stage is complete with this key and all its files are as it wrote them."""
+        record = read_record(self.path, stage)
+        return record.key == key and record.done and not record.faults(self.path)
 
     def unfinished(self) -> list[str]:
         """Stages that were begun and aren't complete."""
-        return [f.stem for f in sorted((self.path / ".stages").glob("*.json")) if not self._state(f.stem).get("done")]
+        return [stage for stage in stages(self.path) if not read_record(self.path, stage).done]
 
-    def _state(self, stage: str) -> dict[str, Any]:
-        try:
-            return json.loads((self.path / ".stages" / f"{stage}.json").read_text())
-        except (OSError, ValueError):
-            return {}
+    def faults(self) -> dict[str, str]:
+        """Say which files are no longer as the run's stages wrote them, and what is wrong with each."""
+        found: dict[str, str] = {}
+        for stage in stages(self.path):
+            found |= read_record(self.path, stage).faults(self.path)
+        return dict(sorted(found.items()))
 
-    def _write_state(self, stage: str, state: dict[str, Any]) -> None:
-        write_text(self.path / ".stages" / f"{stage}.json", json.dumps(state))
+    def folders(self) -> list[Path]:
+        """Folders of the run that stages write into and that are there."""
+        found = [self.path, *(self.path / name for name in (FOLDER, *_OWN))]
+        found += [p for p in (self.path / "silhouettes").glob("*") if p.is_dir()]
+        return [p for p in found if p.is_dir() and not p.is_symlink()]
+
+    def _write_files(self, stage: str, record: StageRecord, files: Iterable[Path]) -> None:
+        marks = {f.relative_to(self.path).as_posix(): FileMark.of(f) for f in files if f.is_file()}
+        write_record(self.path, stage, replace(record, files={**record.files, **marks}))
+
+    def _clear(self, stage: str, own: Sequence[str], derived: Sequence[str]) -> None:
+        """Delete what a stage wrote and what others made from it, and nothing else."""
+        records = {name: read_record(self.path, name) for name in stages(self.path)}
+        written = {name for record in records.values() for name in record.files}
+        gone = set(records[stage].files) if stage in records else set()
+        for name in (*own, *derived):
+            gone |= {n for n in written if n.startswith(f"{name}/")}
+            pattern = _OWN.get(name)
+            if pattern is not None:
+                gone |= {p.relative_to(self.path).as_posix() for p in (self.path / name).glob(pattern)}
+            elif (self.path / name).is_file():
+                gone.add(name)
+        folders = {self.path / name for name in (*own, *derived) if name in _OWN}
+        for name in gone:
+            file = self.path / name
+            if file.parent.resolve().is_relative_to(self.path.resolve()):  # not through a link
+                file.unlink(missing_ok=True)
+                folders |= {p for p in file.parents if p != self.path and p.is_relative_to(self.path)}
+        for folder in sorted(folders, key=lambda p: -len(p.parts)):
+            with suppress(OSError):  # holds files of others
+                folder.rmdir()
+        for name, record in records.items():
+            if name != stage and record.files and not record.files.keys() - gone:
+                forget_record(self.path, name)
 
     # --- records ---
+
+    def claim(self) -> None:
+        """Make sure that what stages will write over is the run's own.
+
+        Raises
+        ------
+        RunError
+            If the folder is no run yet and holds results already, which then are somebody else's.
+        """
+        if self.has("run.toml") or stages(self.path):
+            return
+        patterns = (*(f"{name}/{own}" for name, own in _OWN.items()), *_RESULTS)
+        theirs = next((p for pattern in patterns for p in self.path.glob(pattern)), None)
+        if theirs is not None:
+            raise RunError(f"{theirs}: is there, but not of a run in this folder; move it or choose another folder")
 
     def write_record(self, record: dict[str, Any]) -> None:
         """Write `run.toml`: the configuration, the versions and the source."""
@@ -158,11 +264,15 @@ class Run:
         """
         file = self.path / "run.toml"
         try:
-            return tomllib.loads(file.read_text(encoding="utf-8"))
+            record = tomllib.loads(file.read_text(encoding="utf-8"))
         except OSError:
             raise RunError(f"{self.path}: no run folder, it has no run.toml") from None
-        except tomllib.TOMLDecodeError as error:
-            raise RunError(f"{file}: not valid TOML ({error})") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise RunError(f"{file}: not valid TOML ({error}); delete it and run again") from None
+        for name in ("source", "config", "geomocap"):
+            if not isinstance(record.get(name, {}), dict):
+                raise RunError(f"{file}: {name} is no table, as it is in the record of a run; delete it and run again")
+        return record
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[dict[str, int]]:
@@ -186,6 +296,10 @@ class Run:
     def read_timings(self) -> dict[str, dict[str, float]]:
         """Read `timings.json`; empty if there is none."""
         try:
-            return json.loads((self.path / "timings.json").read_text())
-        except (OSError, ValueError):
+            found = json.loads((self.path / "timings.json").read_text(encoding="utf-8"))
+            return {
+                str(stage): {name: timing[name] + 0 for name in ("seconds", "items", "items_per_second")}
+                for stage, timing in found.items()
+            }
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return {}

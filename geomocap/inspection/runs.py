@@ -10,6 +10,7 @@ import numpy as np
 from geomocap.errors import GeomocapError
 from geomocap.export.run_export import FILES
 from geomocap.export.skeleton_motion import motion_from_skeleton
+from geomocap.files.atomic import remains
 from geomocap.files.results import (
     ELLIPSOIDS,
     KEYPOINTS,
@@ -124,5 +125,7 @@ def _stages(run: Run, told: Description) -> None:
         told.fact(f"time of {name}", f"{timing['seconds']:.1f} s, {timing['items_per_second']:.2f} items/s")
     for name in run.unfinished():
         told.problem(f"stage {name} isn't finished; start the run again and it goes on")
-    for left in run.path.rglob(".*.tmp.*"):
-        told.problem(f"{left.relative_to(run.path)} was left by a killed run; it may be deleted")
+    for name, fault in run.faults().items():
+        told.problem(f"{name} is {fault}; start the run again and it is made again")
+    for left in remains(run.folders()):
+        told.problem(f"{left.relative_to(run.path)} was left by a killed run; the next run removes it")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numba
@@ -41,14 +42,22 @@ def clouds(job: Job) -> str:
     key = stage_key(__name__, "cloud", bounds, before, pictures, settings.model_dump(), capture.info.region_of_interest)
 
     def work() -> int:
-        missing = [k for k in range(capture.n_frames) if not job.run.frame_file("cloud", k).exists()]
+        sound = job.run.sound("cloud")
+        files = {k: cloud_files(job.run, k) for k in range(capture.n_frames)}
+        missing = [k for k, of_frame in files.items() if not sound.issuperset(of_frame)]
         task = _Measure(capture, job.run, settings, groups, bounds, len(missing) == 1)
-        for _ in map_items(task, missing, job.executor, "cloud", job.progress, 4):
-            pass
+        for k, _ in zip(missing, map_items(task, missing, job.executor, "cloud", job.progress, 4), strict=True):
+            job.run.note("cloud", files[k])
         return len(missing)
 
     job.write_record("cloud")
     return job.stage("cloud", key, ["cloud"], work)
+
+
+def cloud_files(run: Run, frame: int) -> list[Path]:
+    """Files of a frame: the points, and how they came about."""
+    points = run.frame_file("cloud", frame)
+    return [points, points.with_suffix(".json")]
 
 
 def cloud_settings(settings: CloudSettings, capture: Capture) -> CloudSettings:

@@ -54,7 +54,7 @@ def segment_with_model(job: Job, geometry: Geometry, source_key: str) -> str:
     )
     outputs = ["ellipsoids.npz", "bodies", "diagnostics.npz", "skeleton.npz", MODEL_FILE]
     work = partial(_follow, job, geometry, model, patches is not None)
-    return job.stage("segmentation", key, outputs, work, [WARNINGS, *FROM_BODIES])
+    return job.stage("segmentation", key, outputs, work, [WARNINGS], FROM_BODIES)
 
 
 def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) -> int:
@@ -78,6 +78,7 @@ def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) ->
         count["items"] = frames
     label = _Label(geometry, job.run, model, followed.bodies)
     fitted = list(map_items(label, range(frames), job.executor, "labels", job.progress))
+    job.run.note("segmentation", [job.run.frame_file("bodies", k) for k in range(frames)])
     write_ellipsoids(job.run, Ellipsoids.stack(fitted, np.arange(model.body_count, dtype=np.int32)))
     write_skeleton(job.run, _skeleton(model, followed, job.fps))
     write_model(job.run.path / MODEL_FILE, model.widened(followed.bodies).reposed(followed.bodies, 0))

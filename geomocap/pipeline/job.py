@@ -14,8 +14,13 @@ from geomocap.config import Config
 from geomocap.files.capture import Capture
 from geomocap.files.run import Run
 from geomocap.files.scans import Scans
+from geomocap.files.stage_records import listed_faults
 from geomocap.progress import Progress, silent
 from geomocap.version import __version__
+
+
+def _say_nothing(_: str) -> None:
+    """Tell nobody."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,8 @@ class Job:
         Frames per second.
     model : Path, optional
         `model.npz` of the subject, from another sequence.
+    tell : callable
+        Told in a line what the user should know.
     """
 
     run: Run
@@ -46,9 +53,16 @@ class Job:
     scans: Scans | None = None
     fps: float = 30.0
     model: Path | None = None
+    tell: Callable[[str], object] = _say_nothing
 
     def stage(
-        self, name: str, key: str, outputs: Sequence[str], work: Callable[[], int], optional: Sequence[str] = ()
+        self,
+        name: str,
+        key: str,
+        outputs: Sequence[str],
+        work: Callable[[], int],
+        optional: Sequence[str] = (),
+        derived: Sequence[str] = (),
     ) -> str:
         """Do a stage's work, unless it has been done with the same key; return the key.
 
@@ -60,14 +74,17 @@ class Job:
         work : callable
             Does the work and returns the number of items worked on.
         optional : sequence of str
-            Files that it may write, or that others make from its outputs; old ones are deleted as well when the key
-            has changed.
+            Files that it may write.
+        derived : sequence of str
+            Files and folders that others make from its outputs, deleted as well when the key has changed.
         """
         if not self.run.is_done(name, key):
-            self.run.begin(name, key, outputs, optional)
+            faults = self.run.begin(name, key, outputs, optional, derived)
+            if faults:
+                self.tell(f"{listed_faults(faults)}; made again by the stage {name}")
             with self.run.timed(name) as count:
                 count["items"] = work()
-            self.run.finish(name)
+            self.run.finish(name, optional)
         return key
 
     def write_record(self, *tables: str) -> None:
@@ -86,6 +103,7 @@ class Job:
             "fps": self.fps,
             "up": self.up,
         }
+        self.run.claim()
         before = self._recorded(source) if tables else {}
         model = before.get("source", {}).get("model") if self.model is None else str(self.model)
         kept = before.get("config", {})

@@ -20,6 +20,8 @@ from geomocap.keypoints.keypoint_regions import KeyPointFile, follow_placed
 from geomocap.model.keypoint_paths import KeyPoints
 from geomocap.pipeline.derived import KEYPOINT_FILES
 
+_STAGE = "keypoints"
+
 
 @dataclass(frozen=True)
 class FollowedKeyPoints:
@@ -48,14 +50,19 @@ def keypoints(run: Run, file: KeyPointFile) -> FollowedKeyPoints:
         write_c3d(c3d, markers)
     except MissingPackageError as error:
         c3d.unlink(missing_ok=True)
-        return FollowedKeyPoints(points, (stored, trc), (str(error),))
-    return FollowedKeyPoints(points, (stored, trc, c3d))
+        found = FollowedKeyPoints(points, (stored, trc), (str(error),))
+    else:
+        found = FollowedKeyPoints(points, (stored, trc, c3d))
+    run.begin(_STAGE, _STAGE, ())  # always made anew, so that its key says nothing
+    run.finish(_STAGE, [file.name for file in found.files])
+    return found
 
 
 def clear_results(run: Run) -> None:
     """Delete what `keypoints` wrote, so that nothing stale is left."""
     for name in KEYPOINT_FILES:
         (run.path / name).unlink(missing_ok=True)
+    run.forget(_STAGE)
 
 
 def run_fps(run: Run) -> float:

@@ -34,6 +34,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     bodies, found = motion.bodies, motion.connected
     label = _Label(geometry, job.run, motion)
     fitted = list(map_items(label, range(frames), job.executor, "labels", job.progress))
+    job.run.note("segmentation", [job.run.frame_file("bodies", k) for k in range(frames)])
     write_ellipsoids(job.run, Ellipsoids.stack(fitted, np.arange(bodies.body_count, dtype=np.int32)))
     write_skeleton(job.run, found.skeleton)
     warnings = [*motion.warnings, *make_model(job, geometry, motion)]

@@ -46,12 +46,14 @@ def segment(job: Job, source: Source) -> str:
     has_tracks = by_motion and _is_tracked(job, source)
     tables = ("nodes", "motion_bodies", "motion_skeleton", "refinement") if by_motion else ("skeleton",)
     settings = {name: getattr(config, name).model_dump() for name in ("segmentation", *tables)}
-    outputs, optional = ["ellipsoids.npz", "bodies", "diagnostics.npz"], [MODEL_FILE, WARNINGS, *FROM_BODIES]
+    outputs, optional = ["ellipsoids.npz", "bodies", "diagnostics.npz"], [MODEL_FILE, WARNINGS]
     # a single frame has no motion to tell bodies and joints by
     (outputs if len(geometry) > 1 else optional).append("skeleton.npz")
     key = stage_key(__name__, "segmentation", source_key, tracks(job) if has_tracks else None, settings, job.fps)
     work = partial(segment_by_motion, has_tracks=has_tracks) if by_motion else segment_as_m3
-    return job.stage("segmentation", key, outputs, lambda: _doubting(job, lambda: work(job, geometry)), optional)
+    return job.stage(
+        "segmentation", key, outputs, lambda: _doubting(job, lambda: work(job, geometry)), optional, FROM_BODIES
+    )
 
 
 def _doubting(job: Job, work: Callable[[], int]) -> int:
@@ -86,6 +88,7 @@ def segment_as_m3(job: Job, geometry: Geometry) -> int:
     write = _WriteBodies(geometry, job.run, found)
     for _ in map_items(write, range(frames), job.executor, "bodies", job.progress):
         pass
+    job.run.note("segmentation", [job.run.frame_file("bodies", k) for k in range(frames)])
     write_ellipsoids(job.run, replace(found.ellipsoids, body=found.body))
     if frames > 1:
         with job.run.timed("skeleton") as count:

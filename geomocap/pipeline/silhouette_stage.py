@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 
-import cv2
 import numpy as np
 
 from geomocap.errors import CaptureError
-from geomocap.files.atomic import write_atomic
 from geomocap.files.capture import Capture
+from geomocap.files.images import write_mask
 from geomocap.files.run import Run, stage_key
 from geomocap.pipeline.job import Job
 from geomocap.scheduling import map_items
@@ -40,14 +37,14 @@ def silhouettes(job: Job) -> str:
 
 
 def _make_silhouettes(job: Job, capture: Capture) -> int:
-    missing = [
-        k for k in range(capture.n_frames) if not all(job.run.silhouette_file(c, k).exists() for c in capture.cameras)
-    ]
+    sound = job.run.sound("silhouettes")
+    files = {k: [job.run.silhouette_file(c, k) for c in capture.cameras] for k in range(capture.n_frames)}
+    missing = [k for k, of_frame in files.items() if not sound.issuperset(of_frame)]
     task: Callable[[int], None] = _Copy(capture, job.run)
     if missing and not capture.has_masks:
         task = _Cut(capture, job.run, learn_scene(job, capture))
-    for _ in map_items(task, missing, job.executor, "silhouettes", job.progress, 4):
-        pass
+    for k, _ in zip(missing, map_items(task, missing, job.executor, "silhouettes", job.progress, 4), strict=True):
+        job.run.note("silhouettes", files[k])
     return len(missing) * len(capture.cameras)
 
 
@@ -102,7 +99,7 @@ class _Cut:
         cameras = self.capture.cameras
         masks = self.scene.silhouettes([self.capture.frame(c, frame) for c in cameras])
         for camera, mask in zip(cameras, masks, strict=True):
-            write_atomic(self.run.silhouette_file(camera, frame), partial(_write_mask, mask * np.uint8(255)))
+            write_mask(self.run.silhouette_file(camera, frame), mask * np.uint8(255))
 
 
 @dataclass(frozen=True)
@@ -114,14 +111,7 @@ class _Copy:
 
     def __call__(self, frame: int) -> None:
         for camera in self.capture.cameras:
-            mask = self.capture.mask(camera, frame)
-            write_atomic(self.run.silhouette_file(camera, frame), partial(_write_mask, mask))
-
-
-def _write_mask(mask: np.ndarray, path: Path) -> bool:
-    """Write a silhouette as a PNG that is made for speed."""
-    parameters = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
-    return cv2.imwrite(str(path), mask, parameters)
+            write_mask(self.run.silhouette_file(camera, frame), self.capture.mask(camera, frame))
 
 
 def _regions(capture: Capture) -> dict[str, np.ndarray]:

@@ -43,7 +43,7 @@ def tracks(job: Job) -> str:
     surface = voxels(job) if _has_hull(capture) else clouds(job)
     key = stage_key(__name__, "tracks", surface, pictures, settings, job.fps)
     job.write_record(*tables)
-    return job.stage("tracks", key, ["tracks.npz"], lambda: _track(job, capture), KEYPOINT_FILES)
+    return job.stage("tracks", key, ["tracks.npz"], lambda: _track(job, capture), derived=KEYPOINT_FILES)
 
 
 def _track(job: Job, capture: Capture) -> int:

@@ -53,10 +53,11 @@ def _carve_all(job: Job, capture: Capture, settings: CarvingSettings) -> int:
     count = min(VOLUME_FRAMES, capture.n_frames)
     sample = np.unique(np.linspace(0, capture.n_frames - 1, count).round().astype(int)).tolist()
     grid = working_volume(_reported(job, task, sample), settings, sample)
-    missing = [k for k in range(capture.n_frames) if not job.run.frame_file("voxels", k).exists()]
+    sound = job.run.sound("voxels")
+    missing = [k for k in range(capture.n_frames) if job.run.frame_file("voxels", k) not in sound]
     task = _Carve(capture, job.run, settings, undistortion, grid)
-    for _ in map_items(task, missing, job.executor, "voxels", job.progress, 8):
-        pass
+    for k, _ in zip(missing, map_items(task, missing, job.executor, "voxels", job.progress, 8), strict=True):
+        job.run.note("voxels", [job.run.frame_file("voxels", k)])
     return len(missing)
 
 

@@ -5,6 +5,7 @@ import trimesh
 from cv2 import imwrite
 
 from geomocap.export.run_export import export_run
+from geomocap.files.atomic import temporary_beside
 from geomocap.files.rigs import write_rig
 from geomocap.inspection import describe
 from geomocap.inspection.describe import InspectionError
@@ -110,7 +111,8 @@ def test_a_run_with_its_flaws(tmp_path):
     run = flawed_run(tmp_path)
     run.frame_file("cloud", 4).unlink()
     run.begin("tracks", "key", [])
-    (tmp_path / ".motion.tmp.bvh").write_text("")
+    left = temporary_beside(tmp_path / "motion.bvh")
+    left.write_text("")
     told, said = facts(tmp_path)
     assert told.kind == "run"
     assert said["skeleton"] == "4 joints between 5 bodies"
@@ -119,7 +121,7 @@ def test_a_run_with_its_flaws(tmp_path):
     assert any("cloud/ lacks 1 frame from 000004 on" in p for p in told.problems)
     assert any("joints lack a position in 1.6 %" in p for p in told.problems)
     assert any("stage tracks isn't finished" in p for p in told.problems)
-    assert any(".motion.tmp.bvh was left" in p for p in told.problems)
+    assert any(f"{left.name} was left" in p for p in told.problems)
     np.savez(tmp_path / "tracks.npz", velocities=np.zeros(3))
     assert any("tracks.npz: has no array positions" in p for p in describe(tmp_path).problems)
 

@@ -41,7 +41,7 @@ def test_failed_writing_keeps_the_old_file_and_says_why(tmp_path):
 
 
 def test_writer_that_silently_writes_nothing_is_noticed(tmp_path):
-    with pytest.raises(RunError, match="nothing was written"):
+    with pytest.raises(RunError, match="could not be written whole"):
         write_atomic(tmp_path / "x.ply", lambda path: False)
 
 

@@ -14,6 +14,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError, RunError
+from geomocap.files.atomic import write_text
 from geomocap.files.frame_files import ply_count, read_points
 from geomocap.files.run import Run
 from geomocap.model.diagnostics import Diagnostics
@@ -27,6 +28,7 @@ from viz.quality_figures import assess, coverage, relative_paths
 from viz.report import Block, Report, Section, render_html, table, video
 from viz.run_contents import Results
 from viz.scene import stage
+from viz.sections import changed_files
 from viz.sheets import overlay, path_sheet
 
 
@@ -88,6 +90,17 @@ def test_pictures_repeat_to_the_bit(made: Made, reviewed: list[Path], tmp_path: 
     assert (tmp_path / "paths.png").read_bytes() == (made.run.path / "review" / "paths.png").read_bytes()
     assert results.skeleton is not None
     assert joint_angles(results.skeleton, 30.0) == (made.run.path / "review" / "joint_angles.png").read_bytes()
+
+
+def test_files_that_are_not_as_they_were_written_are_named(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    run.begin("tracks", "key", ["tracks.npz"])
+    write_text(tmp_path / "tracks.npz", "<tracks>" * 9)
+    run.finish("tracks")
+    assert changed_files(Results(run)) == []
+    (tmp_path / "tracks.npz").write_text("<tracks>")
+    (block,) = changed_files(Results(run))
+    assert block.kind == "warnings" and block.items[1] == "tracks.npz is cut (8 of 72 bytes)."
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,49 @@
+"""The smallest capture that goes all the way, and its run, for what is done hundreds of times."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import sys
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from unittest.mock import patch
+
+from data_tools.figure import figure
+from data_tools.synthesize import SynthesisSettings, synthesize
+
+QUICK = [
+    *("--carving.resolution", "32", "--refinement.rounds", "0", "--motion_bodies.depth_rounds", "0"),
+    *("--no-pictures", "--workers", "1"),
+]
+CHANGING = {"timings.json", "run.toml"}
+
+
+def make_tiny(folder: Path) -> Path:
+    """Synthesize a capture of three frames and four cameras, 96×72."""
+    settings = SynthesisSettings(cameras=4, width=96, height=72, fps=10, frames=3)
+    synthesize(figure(), folder / "capture", folder / "truth", settings)
+    return folder / "capture"
+
+
+def run_tiny(capture: Path, run: Path, *more: str) -> tuple[object, str]:
+    """Run the command line in this process; return its exit status and what it told."""
+    from geomocap.cli import main
+
+    told = io.StringIO()
+    with patch.object(sys, "argv", ["geomocap", "run", str(capture), str(run), *QUICK, *more]):
+        with redirect_stderr(told), redirect_stdout(told):
+            try:
+                main()
+            except SystemExit as end:
+                return end.code or 0, told.getvalue()
+    return 0, told.getvalue()
+
+
+def digests(run: Path) -> dict[str, str]:
+    """Digest of every result file; the records of when and how long are left out."""
+    return {
+        str(p.relative_to(run)): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in sorted(run.rglob("*"))
+        if p.is_file() and p.name not in CHANGING and ".stages" not in p.parts
+    }
