@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import stat
+import struct
 import tomllib
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -120,6 +121,8 @@ def reason(failed: BaseException) -> str:
         return "nested too deeply"
     if isinstance(failed, MemoryError | OverflowError):
         return "it claims impossible sizes"
+    if isinstance(failed, struct.error | EOFError):
+        return "it ends too early"
     if isinstance(failed, OSError) and failed.strerror:
         return failed.strerror
     if isinstance(failed, ValueError) and "integer string conversion" in str(failed):

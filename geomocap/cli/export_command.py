@@ -19,7 +19,6 @@ from geomocap.export.run_names import NAMES_FOUND
 from geomocap.files.atomic import write_bytes
 from geomocap.files.result_schemas import skeleton_gaps
 from geomocap.files.results import read_skeleton
-from geomocap.files.run import Run
 from viz.angle_plots import angle_sheet
 
 
@@ -73,7 +72,7 @@ def export(
             named = [run / NAMES_FOUND] * (exported.found.template is not None)
             opened.renew("export", [*written, *named])
     report_exported(exported)
-    for gap in skeleton_gaps(read_skeleton(Run(run))):
+    for gap in skeleton_gaps(read_skeleton(opened)):
         console.print(f"note: {gap}")
 
 

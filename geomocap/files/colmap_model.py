@@ -6,6 +6,7 @@ cut off makes it wait for ever or take all memory. The formats are those of COLM
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -209,7 +210,7 @@ def _image(name: str, camera: int, values: list[float], where: str) -> PosedImag
     place = f"{where} ({harmless(shortened(name))})"
     if not np.isfinite(values).all():
         raise CalibrationError(f"{place}: its pose holds numbers that are not finite")
-    length = float(np.linalg.norm(quaternion))
+    length = math.hypot(*values[:4])
     if abs(length - 1) > NOT_UNIT:
         raise CalibrationError(f"{place}: its rotation is no unit quaternion (length {length:.4g}); write it again")
     rotation = Rotation.from_quat(quaternion / length, scalar_first=True).as_matrix()

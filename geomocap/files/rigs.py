@@ -116,7 +116,3 @@ def write_model(
         return counts[0] == counts[1]
 
     write_folder(sparse, write, whole, MODEL_FILES)
-
-
-def _first_line(error: BaseException) -> str:
-    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -18,8 +18,6 @@ from geomocap.reading import check_name
 
 FARTHEST = 1e7  # metres of a translation; beyond, single numbers of the surface get lost
 
-LEAST_FOCAL = 1e-3  # of an image's width: it would see 179.9° across
-
 
 @dataclass(frozen=True)
 class Rig:
@@ -199,13 +197,9 @@ class Rig:
         the pixels come from.
         """
         cameras = []
-        for name, camera in zip(self.names, self.cameras, strict=True):
+        for camera in self.cameras:
             w, h = camera.width, camera.height
             fx, fy = camera.focal_length_x, camera.focal_length_y
-            if min(abs(fx), abs(fy)) < LEAST_FOCAL * w:
-                raise CalibrationError(
-                    f"camera {name}: focal length {fx:g}, {fy:g} pixels can't be; calibrate it again"
-                )
             if camera.is_undistorted():
                 K = camera.calibration_matrix()
                 params = [fx, fy, K[0, 2], K[1, 2]]

@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 
 from geomocap.config import load_config
-from geomocap.errors import CaptureError
+from geomocap.errors import CalibrationError, CaptureError
 from geomocap.evaluation.camera_check import check_cameras_of
 from geomocap.files.camera_file import read_camera_doubts
 from geomocap.files.capture import Capture, CaptureInfo, labels_of, write_capture_info
@@ -151,7 +151,8 @@ def test_units_and_focal_lengths_that_cant_be():
         )
     cameras = [pycolmap.Camera(c.todict()) for c in rig.cameras]
     cameras[1].focal_length_x = cameras[1].focal_length_y = -85.0
-    assert "camera cam2: sees" in rig_doubts(Rig(rig.names, tuple(cameras), rig.cam_from_world))[0]
+    with pytest.raises(CalibrationError, match="camera cam2: focal lengths"):
+        Rig(rig.names, tuple(cameras), rig.cam_from_world)
 
 
 def test_labels_are_no_masks():
