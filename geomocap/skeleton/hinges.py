@@ -88,14 +88,14 @@ def hinge_axis(turns: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, 
     """
     axis = main_axis(turns, np.trace(information, axis1=1, axis2=2))
     for _ in range(_ROUNDS):
-        off = _off_axis(turns, axis)
+        off = off_axis(turns, axis)
         across = np.linalg.svd(axis[None])[2][1:]
-        slopes = np.stack([(_off_axis(turns, _tilted(axis, c)) - off) / _TILT for c in across], axis=-1)
+        slopes = np.stack([(off_axis(turns, _tilted(axis, c)) - off) / _TILT for c in across], axis=-1)
         normal = np.einsum("tia,tij,tjb->ab", slopes, information, slopes)
         right = -np.einsum("tia,tij,tj->a", slopes, information, off)
         axis = axis + np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(2) + 1e-12 * np.eye(2), right) @ across
         axis /= np.linalg.norm(axis)
-    return axis, _off_axis(turns, axis)
+    return axis, off_axis(turns, axis)
 
 
 def main_axis(turns: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -109,5 +109,6 @@ def _tilted(axis: np.ndarray, across: np.ndarray) -> np.ndarray:
     return np.cos(_TILT) * axis + np.sin(_TILT) * across
 
 
-def _off_axis(turns: np.ndarray, axis: np.ndarray) -> np.ndarray:
+def off_axis(turns: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """What is left of turns (T, 3, 3) without those about an axis, (T, 3), radians."""
     return Rotation.from_matrix(turns @ np.swapaxes(about_axis(turns, axis), 1, 2)).as_rotvec()

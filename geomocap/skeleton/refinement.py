@@ -13,7 +13,7 @@ from geomocap.skeleton.articulated_adjustment import JointPrior, adjust
 from geomocap.skeleton.body_observations import Observations, SkinPoints
 from geomocap.skeleton.bone_motion import fit_offsets, forward_kinematics
 from geomocap.skeleton.borders import Border
-from geomocap.skeleton.hinges import find_hinges, turn_information
+from geomocap.skeleton.hinges import find_hinges, off_axis, turn_information
 from geomocap.skeleton.kinematics import (
     BodyMotion,
     JointMotion,
@@ -90,7 +90,7 @@ def refine_skeleton(
     points = SkinPoints.of_weights(bodies.rest, bodies.weights)
     misses = np.array([joint.miss for joint in found.joints])
     refined = refine_motion(linkage, motion, points, paths, bodies.diagonal, settings, misses)
-    refined = replace(refined, linkage=_slid(refined.linkage, found.borders))
+    refined = replace(refined, linkage=joints_by_shape(refined.linkage, refined.bodies, found.borders, bodies.noise))
     bodies = replace(
         bodies,
         weights=refined.points.weights(bodies.body_count),
@@ -117,12 +117,29 @@ def refine_skeleton(
     return replace(found, skeleton=skeleton, joints=joints), bodies
 
 
-def _slid(linkage: Linkage, borders: tuple[Border, ...]) -> Linkage:
-    """Linkage in whose hinges the joints are where the bodies' shapes say: the motion leaves open where on the axis."""
-    places = [
-        border.middle_along(joint, axis) if hinge else joint
-        for joint, axis, hinge, border in zip(linkage.joints, linkage.axes, linkage.hinge, borders, strict=True)
-    ]
+def joints_by_shape(linkage: Linkage, bodies: BodyMotion, borders: tuple[Border, ...], noise: float) -> Linkage:
+    """Linkage whose joints are, along their axes, where motion and the bodies' shapes together say.
+
+    Where bodies turn about one axis, points along it are told apart by the turns about other axes alone: a joint is
+    known to the noise of the surface over these turns, however often it is seen, as soft skin errs alike each time.
+    The shapes know it to the spread of the border. In a hinge the motion leaves it open.
+
+    Parameters
+    ----------
+    linkage, bodies
+        Refined.
+    borders : tuple of Border
+        Of each joint's bodies.
+    noise : float, metres
+        Root mean square by which the surface misses where it goes.
+    """
+    places = []
+    for j, (joint, axis, border) in enumerate(zip(linkage.joints, linkage.axes, borders, strict=True)):
+        parent, child = linkage.hierarchy.joint_bodies[j]
+        turns = np.swapaxes(bodies.rotations[:, parent], 1, 2) @ bodies.rotations[:, child]
+        across = 0.0 if linkage.hinge[j] else float(off_axis(turns, axis).var(axis=0).sum())
+        by_shape = noise**2 / max(noise**2 + across * border.spread**2, 1e-18)
+        places.append(joint + by_shape * (border.middle_along(joint, axis) - joint))
     return replace(linkage, joints=np.array(places).reshape(-1, 3))
 
 

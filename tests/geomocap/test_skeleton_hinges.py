@@ -6,9 +6,10 @@ from geomocap.bodies.rigid_motions import fit_rigid_motion
 from geomocap.model.hierarchy import Hierarchy
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.skeleton.body_observations import SkinPoints
-from geomocap.skeleton.hinges import find_hinges, hinge_axis, turn_information
-from geomocap.skeleton.kinematics import Linkage, body_motion, joint_motion
-from geomocap.skeleton.refinement import refine_motion
+from geomocap.skeleton.borders import Border
+from geomocap.skeleton.hinges import find_hinges, hinge_axis, off_axis, turn_information
+from geomocap.skeleton.kinematics import BodyMotion, Linkage, body_motion, joint_motion
+from geomocap.skeleton.refinement import joints_by_shape, refine_motion
 from tests.geomocap.moving_chains import chain
 
 NOISE = 0.004
@@ -85,3 +86,33 @@ def test_refinement_finds_the_hinge_and_its_axis():
     refined = refine_motion(linkage, motion, points, MotionPaths(moved), 0.8)
     assert refined.linkage.hinge[0]
     assert np.rad2deg(np.arccos(abs(refined.linkage.axes[0] @ [0.0, 0.0, 1.0]))) < 0.4
+
+
+@pytest.mark.parametrize(("across_deg", "noise", "by_motion"), [(0.5, 0.03, 0.0), (30.0, 0.001, 1.0)])
+def test_shapes_say_where_on_its_axis_a_joint_is_as_far_as_motion_does_not(across_deg, noise, by_motion):
+    # a wheel between 0.1 and 0.2 m on the axis of a shaft; the motion puts its joint at 0.3 m
+    angle = np.linspace(0.0, 6.0, 50)
+    ring = np.stack([np.cos(angle * 4), np.sin(angle * 4)], axis=1)
+    wheel = np.column_stack([0.5 * ring, np.linspace(0.1, 0.2, 50)])
+    shaft = np.column_stack([0.05 * ring, np.linspace(-1.0, 0.15, 50)])
+    border = Border(0.0, (shaft[30:], wheel[:20]), (np.tile(shaft, (2, 1)), wheel))
+    swing = np.deg2rad(across_deg) * np.sqrt(2.0) * np.sin(np.linspace(0, 2 * np.pi, 20, endpoint=False))
+    turns = Rotation.from_rotvec(np.outer(swing, [1.0, 0.0, 0.0])) * Rotation.from_rotvec(
+        np.outer(np.linspace(0, 3, 20), [0.0, 0.0, 1.0])
+    )
+    rotations = np.stack([np.tile(np.eye(3), (20, 1, 1)), turns.as_matrix()], axis=1)
+    axes, joint = np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, 0.3]])
+    linkage = Linkage(Hierarchy(0, np.array([[0, 1]], np.int32)), joint, axes, np.zeros(1, bool), np.zeros(3))
+    bodies = BodyMotion(rotations, np.zeros((20, 2, 3)))
+    by_shape = border.middle_along(joint[0], axes[0])[2]
+    found = joints_by_shape(linkage, bodies, (border,), noise).joints[0]
+    assert abs(by_shape - 0.3) > 0.1
+    assert (found[2] - by_shape) / (0.3 - by_shape) == pytest.approx(by_motion, abs=0.02)
+    np.testing.assert_array_equal(found[:2], 0.0)
+
+
+def test_turns_off_an_axis_are_what_is_left_without_those_about_it():
+    axis = np.array([0.0, 0.6, 0.8])
+    off = np.array([[0.2, 0.0, 0.0], [0.0, 0.08, -0.06]])
+    turns = Rotation.from_rotvec(off) * Rotation.from_rotvec(np.outer([0.7, -0.4], axis))
+    np.testing.assert_allclose(off_axis(turns.as_matrix(), axis), off, atol=1e-12)
