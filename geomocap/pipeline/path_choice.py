@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from geomocap.errors import GeometryError
@@ -14,6 +16,7 @@ from geomocap.model.trajectories import Trajectories
 from geomocap.nodes.node_tracking import track_nodes
 from geomocap.nodes.surface_coverage import SMALLEST_PIECE, left_over, piece_reach, uncovered_fraction
 from geomocap.pipeline.job import Job
+from geomocap.pipeline.track_stage import frame_reader
 from geomocap.segmentation.m3 import ellipsoid_paths
 from geomocap.trajectories.selection import spread_out
 
@@ -69,7 +72,7 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> tuple[Motion
         if uncovered_fraction(geometry.points, patches.positions, reach) < SMALLEST_PIECE:
             return patches, "patches"
     nodes = _follow_nodes(job, geometry, None if tracked is None else _anchors(tracked))
-    if patches is None:
+    if patches is None or job.capture is not None:
         return nodes, "nodes" if tracked is None else "both"
     rest = left_over(nodes.positions, patches.positions, reach)
     return _joined(patches, nodes, rest), "pieces"
@@ -81,8 +84,14 @@ def _follow_nodes(job: Job, geometry: Geometry, anchors: np.ndarray | None) -> M
     following = job.config.nodes
     if job.capture is not None:  # the hull changes its shape with the pose: what is rigid doesn't look so
         following = following.model_copy(update={"part_rounds": 0})
-    nodes = track_nodes(geometry.points, len(geometry), following, features, job.progress, job.executor, anchors)
-    return nodes.motion_paths()
+    images = None
+    if job.capture is not None and anchors is not None:
+        images = frame_reader(job.capture, job.run, job.config.tracking)
+    nodes = track_nodes(
+        geometry.points, len(geometry), following, features, job.progress, job.executor, anchors, images
+    )
+    # nodes that images hold are as precise as their neighbourhood shows; the geometry doesn't know it
+    return nodes.motion_paths() if images is None else replace(nodes.motion_paths(), sigma=None)
 
 
 def point_paths(job: Job, geometry: Geometry) -> MotionPaths | None:
