@@ -87,7 +87,7 @@ class FrameImages:
         """Cut out the subject; `length` (m) and `origin` (3,), metres, are the unit's."""
         o = np.zeros(3) if origin is None else origin
         H, W = views.masks.shape[1:]
-        rows, columns = views.masks.any(axis=2), views.masks.any(axis=1)
+        rows, columns = np.asarray(views.masks.any(axis=2)), np.asarray(views.masks.any(axis=1))
         low = np.stack([np.maximum(_first(columns) - HALF, 0), np.maximum(_first(rows) - HALF, 0)], axis=1)
         high = np.stack([W - _first(columns[:, ::-1]) + HALF, H - _first(rows[:, ::-1]) + HALF], axis=1)
         w, h = np.minimum(np.max(high - low, axis=0), (W, H))
