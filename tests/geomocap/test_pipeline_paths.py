@@ -121,8 +121,7 @@ def test_few_patches_where_they_are_asked_for(job):
 
 
 def test_ellipsoids_of_the_paper(job):
-    paths, source = motion_paths(job("ellipsoids"), Ball(), False)
-    assert source == "ellipsoids"
+    paths = motion_paths(job("ellipsoids"), Ball(), False)["ellipsoids"]
     middles = [Ball().points(k).mean(axis=0) for k in range(FRAMES)]
     np.testing.assert_allclose(paths.positions, [middles], atol=1e-6)  # the ball is one
 
