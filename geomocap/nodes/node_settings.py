@@ -21,6 +21,9 @@ class NodeTrackingSettings(Settings):
         0.1, gt=0, description="resistance to bending and stretching, relative to the points' pull"
     )
     fine_stiffness: float = Field(1.5, gt=0, description="the same for the fine graph")
+    image_stiffness: float = Field(
+        1.0, gt=0, description="the same for the fine graph where images guide it (0.7 to 2 measure alike)"
+    )
     normal_weight: float = Field(1.0, ge=0, description="weight of normals against positions when points are matched")
     give: float = Field(0.3, gt=0, description="strain at which an edge gives way (fraction of its length)")
     strain_cost: float = Field(1.0, ge=0, description="cost of strain relative to that of unexplained points")

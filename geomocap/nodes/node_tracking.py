@@ -17,6 +17,8 @@ from geomocap.nodes.coarse_motion import CoarseModel, CoarseTarget, State, follo
 from geomocap.nodes.correspondences import Target, pull
 from geomocap.nodes.deformation import block_pattern, step
 from geomocap.nodes.extremities import extremities
+from geomocap.nodes.image_motion import ImageMotion, NodeState
+from geomocap.nodes.image_pull import FrameImages, Views
 from geomocap.nodes.keyframes import most_open, openness
 from geomocap.nodes.node_graph import farthest_points, largest_parts, node_graph
 from geomocap.nodes.node_settings import NodeTrackingSettings
@@ -165,14 +167,29 @@ class NodeModel:
             rough = float(np.median(np.abs(found.across))) / (USUAL_NOISE * h)
             firm = stiffness * s.fine_stiffness * min(max(rough, 0.25), 1.0)
             x, R = step(g, self.pattern, x, R, firm * fraction * soft, found.A, found.b, 60)
+        anchored = np.bincount(marks.sample, minlength=len(g.samples)).astype(float)
+        return x, R, *self.held(target, x, R, anchored)
+
+    def held(
+        self, target: Target, x: np.ndarray, R: np.ndarray, anchored: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """How a frame's points, and anchors at the samples (S,), hold nodes: covariances (N, 3, 3), which are lost."""
+        g, s, h = self.graph, self.settings, self.graph.spacing
+        c = max(FINE[-1][0] * h, 1.5 * self.spacing)
         y, normals = g.deform(x, R)
         tree = cKDTree(target.coordinates(c))
         found = pull(target, tree, y, normals, g.features, c, s.point_weight, 0.0)
-        anchored = np.bincount(marks.sample, minlength=len(y)).astype(float)
         covariance, support = node_covariance(
             self.patches, normals, found.support, found.across, s.slide * h, s.noise * h, anchored
         )
-        return x, R, covariance, support < s.lost_below
+        return covariance, support < s.lost_below
+
+    def image_motion(self) -> ImageMotion:
+        """Return what follows the fine graph in images too."""
+        s = self.settings
+        return ImageMotion(
+            self.graph, self.pattern, self.spacing, s.image_stiffness, s.give, s.strain_cost, s.point_weight
+        )
 
 
 def track_nodes(
@@ -183,6 +200,7 @@ def track_nodes(
     progress: Progress = silent,
     executor: Executor | None = None,
     anchors: np.ndarray | None = None,
+    images: Callable[[int], Views] | None = None,
 ) -> NodeTracks:
     """Follow nodes of a surface through all frames, forwards and backwards from the most open one.
 
@@ -200,6 +218,8 @@ def track_nodes(
     anchors : (P, T, 3) float, metres, optional
         Trajectories of points of the surface that are known from elsewhere, NaN where they are not: nodes near them do
         not slide.
+    images : callable, optional
+        `images(frame)`, what the cameras see: nodes move as it does.
 
     Raises
     ------
@@ -211,7 +231,7 @@ def track_nodes(
         raise GeometryError("nodes can't be tracked through a sequence without frames")
     if executor is None:
         with threads() as own:
-            return track_nodes(points, n_frames, settings, features, progress, own, anchors)
+            return track_nodes(points, n_frames, settings, features, progress, own, anchors, images)
     unit = Unit.of(np.asarray(points(0), float))
 
     def prepare(frame: int) -> PointSet:
@@ -260,9 +280,12 @@ def track_nodes(
         return model.refine(target, states[frame], homes[frame], known[:, frame])
 
     fine = list(map_items(refine, list(range(n_frames)), executor, "nodes", progress))
+    if images is not None:
+        geometric = [(f[0], f[1]) for f in fine]
+        fine = _followed_in_images(model, frames, geometric, reference, images, unit, executor, progress)
     x, R, covariance, lost = (np.stack([f[k] for f in fine], axis=1) for k in range(4))
     parts = None
-    if settings.part_rounds and not len(known):
+    if settings.part_rounds and not len(known) and images is None:
         targets = [Target(frame, scales, settings.normal_weight) for frame in frames]
         found, covariance = find_rigid_parts(
             model.graph, targets, x, R, reference, 1.5 * model.spacing, settings, executor
@@ -272,3 +295,33 @@ def track_nodes(
     x[lost] = np.nan
     places = unit.back(model.graph.nodes)
     return NodeTracks(unit.back(x), R, unit.length**2 * covariance, reference, places, model.graph.edges, parts)
+
+
+def _followed_in_images(
+    model: NodeModel,
+    frames: list[PointSet],
+    geometric: list[NodeState],
+    reference: int,
+    images: Callable[[int], Views],
+    unit: Unit,
+    executor: Executor,
+    progress: Progress,
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """Follow the fine graph in points and images; positions, rotations, covariances, which are lost, of each frame."""
+    settings = model.settings
+    targets = [Target(f, np.full(f.features.shape[1], settings.feature_scale), settings.normal_weight) for f in frames]
+    ahead, back = map_items(
+        lambda way: model.image_motion().follow(
+            targets,
+            lambda k: FrameImages.of(images(k), unit.length, unit.origin),
+            geometric,
+            reference,
+            way,
+        ),
+        [1, -1],
+        executor,
+        "motion in images",
+        progress,
+    )
+    states = back[:0:-1] + ahead
+    return [(x, R, *model.held(t, x, R)) for t, (x, R) in zip(targets, states, strict=True)]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geomocap.evaluation.surface_agreement import surface_disagreement
 from geomocap.files.corrected_cameras import camera_warnings
 from geomocap.files.results import write_diagnostics, write_ellipsoids, write_points, write_skeleton, write_warnings
 from geomocap.files.run import Run
@@ -13,6 +14,7 @@ from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.ellipsoids import Ellipsoids, fit_ellipsoids
 from geomocap.model.frame_geometry import BodyPoints, Geometry
 from geomocap.motion import Motion, MotionSettings, find_motion
+from geomocap.nodes.surface_coverage import looks, piece_reach
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.path_choice import motion_paths
 from geomocap.pipeline.subject_stage import make_model
@@ -25,12 +27,17 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     `has_tracks` is what `motion_paths` takes.
     """
     frames, config = len(geometry), job.config
-    paths, source = motion_paths(job, geometry, has_tracks)
+    choice = motion_paths(job, geometry, has_tracks)
     settings = MotionSettings(
         bodies=config.motion_bodies, skeleton=config.motion_skeleton, refinement=config.refinement, nodes=config.nodes
     )
     with job.run.timed("motion") as count:
-        motion = find_motion(paths, fps=job.fps, settings=settings, progress=job.progress)
+        found_from = {
+            source: find_motion(paths, fps=job.fps, settings=settings, progress=job.progress)
+            for source, paths in choice.items()
+        }
+        source = _best(found_from, geometry)
+        motion = found_from[source]
         count["items"] = frames
     bodies, found = motion.bodies, motion.connected
     label = _Label(geometry, job.run, motion)
@@ -58,6 +65,20 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     )
     write_diagnostics(job.run, made)
     return frames
+
+
+def _best(found: dict[str, Motion], geometry: Geometry) -> str:
+    """Which motion's bodies carry the surface of each frame best onto that of the others."""
+    if len(found) < 2:
+        return next(iter(found))
+    reach, frames = piece_reach(geometry.points(0)), looks(len(geometry))
+
+    def disagreement(source: str) -> float:
+        motion = found[source]
+        bodies = motion.bodies
+        return surface_disagreement(geometry.points, motion.label, bodies.rotations, bodies.translations, frames, reach)
+
+    return min(found, key=disagreement)
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from geomocap.errors import GeometryError
+from geomocap.files.corrected_cameras import as_seen
 from geomocap.files.results import read_trajectories
 from geomocap.files.scan_tracks import scan_tracks
 from geomocap.files.scans import Scans
@@ -14,6 +17,7 @@ from geomocap.model.trajectories import Trajectories
 from geomocap.nodes.node_tracking import track_nodes
 from geomocap.nodes.surface_coverage import SMALLEST_PIECE, left_over, piece_reach, uncovered_fraction
 from geomocap.pipeline.job import Job
+from geomocap.pipeline.track_stage import frame_reader
 from geomocap.segmentation.m3 import ellipsoid_paths
 from geomocap.trajectories.selection import spread_out
 
@@ -25,12 +29,12 @@ ANCHORS = 2000  # trajectories that keep nodes from sliding
 ANCHOR_FRACTION = 0.1  # those are measured in this fraction of the frames at least
 
 
-def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> tuple[MotionPaths, str]:
-    """Motion paths and what they are.
+def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, MotionPaths]:
+    """Motion paths by what they are; where there is a choice, whichever makes the bodies that carry the surface best.
 
-    These are "patches", "nodes", "both" (nodes held by patches), "pieces" (patches, and where these leave pieces of the
-    surface uncovered, nodes held by them), "points" or "ellipsoids". Nodes are followed only where some piece needs
-    them.
+    They are "patches", "nodes", "both" (nodes held by patches and images), "pieces" (patches, and where these leave
+    pieces of the surface uncovered, such nodes), "points" or "ellipsoids". Nodes are followed only where some piece
+    needs them; then "pieces" and "both" are returned.
 
     Parameters
     ----------
@@ -47,11 +51,11 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> tuple[Motion
     wanted = job.config.segmentation.paths
     given = point_paths(job, geometry)
     if given is not None:
-        return given, "points"
+        return {"points": given}
     if wanted == "ellipsoids":
         settings = job.config.segmentation
         found = ellipsoid_paths(geometry.points, len(geometry), geometry.spacing, settings, job.executor, job.progress)
-        return MotionPaths(found.ellipsoids.centers.swapaxes(0, 1)), wanted
+        return {wanted: MotionPaths(found.ellipsoids.centers.swapaxes(0, 1))}
     tracked = read_trajectories(job.run) if has_tracks else None
     patches = None if tracked is None or wanted == "both" else patch_paths(tracked)
     if wanted == "patches":
@@ -59,20 +63,21 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> tuple[Motion
             raise GeometryError(
                 f"{job.run.path}: no surface patches could be followed in the images; set segmentation.paths = nodes"
             )
-        return patches, "patches"
+        return {"patches": patches}
     reach = 0.0
     if patches is not None:
         if patches.ray is not None:
             # single cameras follow the rest of the surface: what is still uncovered is bulk of a hull of few cameras
-            return patches, "patches"
+            return {"patches": patches}
         reach = piece_reach(geometry.points(0))
         if uncovered_fraction(geometry.points, patches.positions, reach) < SMALLEST_PIECE:
-            return patches, "patches"
+            return {"patches": patches}
     nodes = _follow_nodes(job, geometry, None if tracked is None else _anchors(tracked))
     if patches is None:
-        return nodes, "nodes" if tracked is None else "both"
+        return {"nodes": nodes} if tracked is None else {"both": replace(nodes, sigma=None)}
     rest = left_over(nodes.positions, patches.positions, reach)
-    return _joined(patches, nodes, rest), "pieces"
+    # nodes that images hold are as precise as their neighbourhood shows; the geometry doesn't know it
+    return {"pieces": _joined(patches, nodes, rest), "both": replace(nodes, sigma=None)}
 
 
 def _follow_nodes(job: Job, geometry: Geometry, anchors: np.ndarray | None) -> MotionPaths:
@@ -81,7 +86,12 @@ def _follow_nodes(job: Job, geometry: Geometry, anchors: np.ndarray | None) -> M
     following = job.config.nodes
     if job.capture is not None:  # the hull changes its shape with the pose: what is rigid doesn't look so
         following = following.model_copy(update={"part_rounds": 0})
-    nodes = track_nodes(geometry.points, len(geometry), following, features, job.progress, job.executor, anchors)
+    images = None
+    if job.capture is not None and anchors is not None:
+        images = frame_reader(as_seen(job.run, job.capture), job.run, job.config.tracking)
+    nodes = track_nodes(
+        geometry.points, len(geometry), following, features, job.progress, job.executor, anchors, images
+    )
     return nodes.motion_paths()
 
 
@@ -120,13 +130,8 @@ def _joined(patches: MotionPaths, nodes: MotionPaths, rest: np.ndarray) -> Motio
     if not rest.any():
         return patches
     positions = np.concatenate([patches.positions, nodes.positions[rest]])
-    assert patches.sigma is not None and nodes.sigma is not None
-    sigma = np.concatenate([patches.sigma, nodes.sigma[rest]])
-    if patches.ray is None:
-        return MotionPaths(positions, sigma=sigma)
-    return MotionPaths(
-        positions, sigma=sigma, ray=np.concatenate([patches.ray, np.zeros((rest.sum(), *patches.ray.shape[1:]))])
-    )
+    assert patches.sigma is not None and nodes.sigma is not None and patches.ray is None
+    return MotionPaths(positions, sigma=np.concatenate([patches.sigma, nodes.sigma[rest]]))
 
 
 def _anchors(tracked: Trajectories) -> np.ndarray | None:

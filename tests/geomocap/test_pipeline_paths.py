@@ -66,19 +66,20 @@ def trajectories(count: int, seen: float, lowest: float = -1.0) -> np.ndarray:
 
 
 def test_nodes_leave_colours_alone(job):
-    paths, source = motion_paths(job("nodes"), Ball(), False)
-    assert source == "nodes"
-    assert paths.count == 60
+    found = motion_paths(job("nodes"), Ball(), False)
+    assert list(found) == ["nodes"]
+    assert found["nodes"].count == 60
 
 
 def test_patches_where_they_cover_the_subject(job):
-    assert motion_paths(job("auto", trajectories(500, 1.0)), Ball(), True)[1] == "patches"
+    assert list(motion_paths(job("auto", trajectories(500, 1.0)), Ball(), True)) == ["patches"]
 
 
 def test_nodes_on_the_piece_that_patches_leave_uncovered(job):
     tracks = trajectories(300, 1.0, 0.0)
-    paths, source = motion_paths(job("auto", tracks), Ball(), True)
-    assert source == "pieces"
+    found = motion_paths(job("auto", tracks), Ball(), True)
+    assert list(found) == ["pieces", "both"]
+    paths = found["pieces"]
     patches, nodes = paths.positions[:300], paths.positions[300:]
     np.testing.assert_array_equal(patches, tracks)
     assert 15 <= len(nodes) <= 30  # of 60, those on the half without patches
@@ -91,36 +92,36 @@ def test_what_single_cameras_leave_uncovered_is_bulk_of_the_hull_and_gets_no_nod
     tracks = trajectories(300, 1.0, 0.0)
     ray = np.zeros_like(tracks)
     ray[::2, :, 1] = 1.0
-    assert motion_paths(job("auto", tracks, ray), Ball(), True)[1] == "patches"
+    assert list(motion_paths(job("auto", tracks, ray), Ball(), True)) == ["patches"]
 
 
 def test_nodes_where_patches_are_there_for_a_while_only(job):
     tracks = trajectories(300, 1.0)
     tracks[:, 1:][tracks[:, 1:, 2] < 0] = np.nan  # 2 of 3 frames
-    paths, source = motion_paths(job("auto", tracks), Ball(), True)
-    assert source == "pieces"
+    found = motion_paths(job("auto", tracks), Ball(), True)
+    assert list(found) == ["pieces", "both"]
+    paths = found["pieces"]
     assert (np.nanmax(paths.positions[300:, :, 2], axis=1) < 0.0).all()
 
 
 def test_nodes_without_patches(job):
-    assert motion_paths(job("auto"), Ball(), False)[1] == "nodes"
+    assert list(motion_paths(job("auto"), Ball(), False)) == ["nodes"]
 
 
 def test_tracks_of_another_job_are_left_alone(job):
-    assert motion_paths(job("auto", trajectories(500, 1.0)), Ball(), False)[1] == "nodes"
+    assert list(motion_paths(job("auto", trajectories(500, 1.0)), Ball(), False)) == ["nodes"]
 
 
 def test_both_although_patches_cover_the_subject(job):
-    assert motion_paths(job("both", trajectories(500, 1.0)), Ball(), True)[1] == "both"
+    assert list(motion_paths(job("both", trajectories(500, 1.0)), Ball(), True)) == ["both"]
 
 
 def test_few_patches_where_they_are_asked_for(job):
-    assert motion_paths(job("patches", trajectories(100, 1.0, 0.8)), Ball(), True)[1] == "patches"
+    assert list(motion_paths(job("patches", trajectories(100, 1.0, 0.8)), Ball(), True)) == ["patches"]
 
 
 def test_ellipsoids_of_the_paper(job):
-    paths, source = motion_paths(job("ellipsoids"), Ball(), False)
-    assert source == "ellipsoids"
+    paths = motion_paths(job("ellipsoids"), Ball(), False)["ellipsoids"]
     middles = [Ball().points(k).mean(axis=0) for k in range(FRAMES)]
     np.testing.assert_allclose(paths.positions, [middles], atol=1e-6)  # the ball is one
 

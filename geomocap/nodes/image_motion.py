@@ -1,0 +1,237 @@
+"""Nodes followed in the images too: geometry says where a surface is, images how it moves within itself.
+
+From the reference frame on, both ways, each frame's nodes answer to the frame's points, to their own stiffness and to
+the images of earlier frames, in one system of equations. Earlier frames are several, near and far in time: near ones
+look alike, far ones keep errors from adding up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from geomocap.model.rotations import nearest_rotation
+from geomocap.nodes.correspondences import Target, pull
+from geomocap.nodes.deformation import BlockPattern, step
+from geomocap.nodes.image_pull import HALF, LEAST_COSINE, FrameImages, window_pulls
+from geomocap.nodes.node_graph import NodeGraph
+
+EARLIER = (1, 4, 16)
+"""Frames before the present one that its images are compared with."""
+_SCALE = 0.6  # distance at which a point loses its weight, node spacings
+_STEPS = (3, 3)  # on coarse and on fine images
+_SPREAD = (3.0, 1.0)  # pixels between those of a window, on coarse and on fine images
+_NORMAL = 1.4826  # standard deviation of a normal distribution, from its median distance
+_DEPARTED = 3.0  # squared differences of so many times the median lose three quarters of their weight
+_CORRELATED = 0.3  # of the points' pull is counted: a hull's errors are alike over a piece of it
+
+NodeState = tuple[np.ndarray, np.ndarray]
+"""Places (N, 3) and rotations (N, 3, 3) of the nodes in a frame."""
+
+
+@dataclass(frozen=True)
+class _Earlier:
+    """An earlier frame: its images, samples, their tangent axes, and how squarely cameras saw them."""
+
+    images: FrameImages
+    places: np.ndarray
+    axes: np.ndarray
+    cosine: np.ndarray
+
+
+@dataclass(frozen=True)
+class ImageMotion:
+    """Follows a node graph through frames of points and images.
+
+    Attributes
+    ----------
+    graph : NodeGraph
+    pattern : BlockPattern
+    point_spacing : float
+        Distance of neighbouring points of a frame.
+    stiffness, give, strain_cost : float
+        See `NodeTrackingSettings`.
+    point_weight : float
+        Pull along the surface relative to that across it.
+    """
+
+    graph: NodeGraph
+    pattern: BlockPattern
+    point_spacing: float
+    stiffness: float
+    give: float
+    strain_cost: float
+    point_weight: float
+
+    def follow(
+        self,
+        frames: list[Target],
+        read: Callable[[int], FrameImages],
+        geometric: list[NodeState],
+        reference: int,
+        way: int,
+    ) -> list[NodeState]:
+        """Follow the graph from the reference frame on, forwards (way 1) or backwards (way −1).
+
+        Each frame is tried from where the motion so far leads, and from where the geometry alone has it; what explains
+        points and images better is kept.
+
+        Parameters
+        ----------
+        frames : list of Target
+        read : callable
+            `read(frame)`; frames are asked for in their order, once each.
+        geometric : list of NodeState
+            All frames, followed in the geometry alone.
+        reference, way : int
+
+        Returns
+        -------
+        list of NodeState
+            The reference's first.
+        """
+        g = self.graph
+        states: list[NodeState] = [(g.nodes, np.tile(np.eye(3), (len(g.nodes), 1, 1)))]
+        seen = [self._seen(read(reference), states[0])]
+        for t in range(reference + way, len(frames) if way > 0 else -1, way):
+            images = read(t)
+            earlier = [seen[-k] for k in EARLIER if k <= len(seen)]
+            starts = [_carried(geometric[t - way], geometric[t], states[-1], g.spacing)]
+            if len(states) > 1:
+                starts.insert(0, _continued(states[-2], states[-1]))
+            found = [self._fit(frames[t], images, earlier, start, 0) for start in starts]
+            best = found[0][0] if len(found) < 2 else self._better(frames[t], found)
+            states.append(self._fit(frames[t], images, earlier, best, 1)[0])
+            seen = [*seen[-max(EARLIER) + 1 :], self._seen(images, states[-1])]
+        return states
+
+    def _better(self, frame: Target, found: list[tuple[NodeState, np.ndarray]]) -> NodeState:
+        """Return the state that leaves least of the points and of the images unexplained and is strained least.
+
+        Images are compared where both states have them.
+        """
+        usual = np.median(np.concatenate([e[np.isfinite(e)] for _, e in found]))
+        both = np.logical_and.reduce([np.isfinite(e) for _, e in found])
+        costs = []
+        for (x, R), errors in found:
+            y, normals = self.graph.deform(x, R)
+            c = self._scale()
+            points = pull(frame, cKDTree(frame.coordinates(c)), y, normals, self.graph.features, c, 0.0, 0.0)
+            strain = float(np.minimum((self.graph.strain(x, R) / self.give) ** 2, 1.0).mean())
+            unlike = float((errors[both] / (errors[both] + usual)).mean()) if both.any() else 0.0
+            costs.append(points.energy + self.strain_cost * strain + unlike)
+        return found[int(np.argmin(costs))][0]
+
+    def _scale(self) -> float:
+        return max(_SCALE * self.graph.spacing, 1.5 * self.point_spacing)
+
+    def _seen(self, images: FrameImages, state: NodeState) -> _Earlier:
+        y, normals = self.graph.deform(*state)
+        return _Earlier(images, y, self._axes(state[1]), images.look(y, normals)[0])
+
+    def _axes(self, R: np.ndarray) -> np.ndarray:
+        """Two axes of the tangent plane of each sample, turned as its nodes are: (S, 2, 3)."""
+        g = self.graph
+        n = g.normals
+        other = np.where(np.abs(n[:, :1]) < 0.7, np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]]))
+        first = np.cross(n, other)
+        first /= np.linalg.norm(first, axis=1, keepdims=True)
+        turn = (g.weights[..., None, None] * R[g.binding]).sum(axis=1)
+        return np.ascontiguousarray(np.einsum("sij,skj->ski", turn, np.stack([first, np.cross(n, first)], axis=1)))
+
+    def _fit(
+        self, frame: Target, images: FrameImages, earlier: list[_Earlier], start: NodeState, level: int
+    ) -> tuple[NodeState, np.ndarray]:
+        """Fit on images of a level; the state, and the mean squared difference of each window, NaN where not seen."""
+        x, R = start
+        g, c = self.graph, self._scale()
+        frame = replace(frame, points=frame.points.turned_like(*g.deform(x, R), 0.5 * g.spacing))
+        tree = cKDTree(frame.coordinates(c))
+        fraction = len(g.samples) / len(g.nodes) / 4
+        errors = np.zeros((0,))
+        for _ in range(_STEPS[level]):
+            y, normals = g.deform(x, R)
+            found = pull(frame, tree, y, normals, g.features, c, self.point_weight, 0.0)
+            A, b = _CORRELATED * found.A, _CORRELATED * found.b
+            noise = max(_NORMAL * float(np.median(np.abs(found.across))), 0.3 * self.point_spacing)
+            errors = self._add_images(A, b, noise, images, earlier, y, normals, self._axes(R), level)
+            soft = 1 / (1 + (g.strain(x, R) / self.give) ** 2) ** 2
+            x, R = step(g, self.pattern, x, R, self.stiffness * fraction * soft, A, b, 60)
+        return (x, R), errors
+
+    def _add_images(
+        self,
+        A: np.ndarray,
+        b: np.ndarray,
+        noise: float,
+        images: FrameImages,
+        earlier: list[_Earlier],
+        y: np.ndarray,
+        normals: np.ndarray,
+        axes: np.ndarray,
+        level: int,
+    ) -> np.ndarray:
+        """Add what images pull to A (S, 3, 3) and b (S, 3), in place; the windows' mean squared differences (E, S, C).
+
+        Points pull with weight 1 at their standard deviation `noise`; images' weights are put into that unit. Pixels
+        that the windows of several samples hold count once.
+        """
+        S, C = len(y), len(images.projections)
+        cosine, pixel = images.look(y, normals)
+        spread = _SPREAD[level] * pixel
+        own = 0.9 * self.graph.spacing**2 * len(self.graph.nodes) / S
+        once = np.minimum(own / ((2 * HALF + 1) * spread) ** 2 * np.maximum(cosine, LEAST_COSINE), 1.0)
+        errors = np.full((len(earlier), S, C), np.nan)
+        for k, then in enumerate(earlier):
+            more, pulled = np.zeros((S, C, 3, 3)), np.zeros((S, C, 3))
+            total, count = np.zeros((S, C)), np.zeros((S, C), np.int64)
+            window_pulls(
+                images.levels[level],
+                then.images.levels[level],
+                images.projections,
+                then.images.projections,
+                images.masks,
+                then.images.masks,
+                y,
+                axes,
+                then.places,
+                then.axes,
+                spread,
+                (cosine > 0) & (then.cosine > 0),
+                HALF,
+                more,
+                pulled,
+                total,
+                count,
+            )
+            known = count > 0
+            if not known.any():
+                continue
+            mean = total / np.maximum(count, 1)
+            usual = max(float(np.median(mean[known])), 1e-6)
+            weight = np.where(known, once / (1 + mean / (_DEPARTED * usual)) ** 2, 0.0) * noise**2 / usual
+            A += (weight[..., None, None] * more).sum(axis=1)
+            b += (weight[..., None] * pulled).sum(axis=1)
+            errors[k][known] = mean[known]
+        return errors
+
+
+def _continued(before: NodeState, last: NodeState) -> NodeState:
+    """Go on with the motion of the last frame."""
+    (x0, R0), (x, R) = before, last
+    return 2 * x - x0, R @ R0.transpose(0, 2, 1) @ R
+
+
+def _carried(before: NodeState, after: NodeState, state: NodeState, spacing: float) -> NodeState:
+    """Move a state as the nodes of another solution that are near it move between two frames."""
+    x, R = state
+    distance, near = cKDTree(before[0]).query(x, 4)
+    weight = np.exp(-0.5 * (distance / spacing) ** 2) + 1e-9
+    weight /= weight.sum(axis=1, keepdims=True)
+    turn = after[1] @ before[1].transpose(0, 2, 1)
+    moved = after[0][near] + np.einsum("nkij,nkj->nki", turn[near], x[:, None] - before[0][near])
+    blend = (weight[..., None, None] * turn[near]).sum(axis=1)
+    return (weight[..., None] * moved).sum(axis=1), nearest_rotation(blend) @ R

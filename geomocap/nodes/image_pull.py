@@ -1,0 +1,245 @@
+"""What images ask of a deforming surface: each sample's window looks the same in two frames of every camera.
+
+A window is a piece of the sample's tangent plane, turned as its nodes are. With I(q) the image of one frame where the
+window is, and J(q) that of an earlier one where it was, both less their means over the window,
+
+    E = Σ_samples Σ_cameras Σ_q (I(q) − J(q))² / σ²
+
+is linearised in the sample's place and joins the deformation's normal equations. What a window without texture asks is
+little and what an edge asks is across it, by itself: there is no threshold below which a sample isn't followed.
+
+Source: B. Lucas, T. Kanade, "An iterative image registration technique", IJCAI 1981, in space instead of an image, as
+in F. Devernay, D. Mateus, M. Guilbert, "Multi-camera scene flow by tracking 3-D points and surfels", CVPR 2006.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numba import njit
+
+HALF = 3
+"""Half a window's side, pixels (2 and 3 measure alike)."""
+LEAST_COSINE = 0.25
+"""Surfaces seen at a smaller angle (its sine) say nothing."""
+_LEAST_FILLED = 0.5  # of a window that is on the subject in both frames
+_HIDING = 3.0  # voxels by which a surface must be nearer to hide a sample
+
+
+class Views(Protocol):
+    """One frame in all cameras, as `patches.frame_views.FrameViews` holds it."""
+
+    @property
+    def levels(self) -> np.ndarray:
+        """Blurred grey images (L, C, H, W) float32, coarsest first."""
+
+    @property
+    def masks(self) -> np.ndarray:
+        """Silhouettes (C, H, W) uint8."""
+
+    @property
+    def depth(self) -> np.ndarray:
+        """Depth of the surface (C, H, W) float32, metres."""
+
+    @property
+    def projections(self) -> np.ndarray:
+        """World metres to array indices (C, 3, 4), third row of unit length."""
+
+    @property
+    def voxel_size(self) -> float:
+        """Metres."""
+
+
+@dataclass(frozen=True)
+class FrameImages:
+    """The part of a frame's images that shows the subject, in the unit that the surface is followed in.
+
+    Attributes
+    ----------
+    levels : (L, C, h, w) float32
+    masks : (C, h, w) uint8
+    depth : (C, h, w) float32, metres
+    projections : (C, 3, 4) float
+        To array indices of the part; the third row gives the depth in metres.
+    centers : (C, 3) float
+        Camera centres.
+    hiding : float, metres
+        Depth by which a surface must be nearer to hide another.
+    focal : (C,) float
+        Pixels.
+    length : float
+        Metres of the unit.
+    """
+
+    levels: np.ndarray
+    masks: np.ndarray
+    depth: np.ndarray
+    projections: np.ndarray
+    centers: np.ndarray
+    hiding: float
+    focal: np.ndarray
+    length: float
+
+    @classmethod
+    def of(cls, views: Views, length: float = 1.0, origin: np.ndarray | None = None) -> FrameImages:
+        """Cut out the subject; `length` (m) and `origin` (3,), metres, are the unit's."""
+        o = np.zeros(3) if origin is None else origin
+        H, W = views.masks.shape[1:]
+        rows, columns = np.asarray(views.masks.any(axis=2)), np.asarray(views.masks.any(axis=1))
+        low = np.stack([np.maximum(_first(columns) - HALF, 0), np.maximum(_first(rows) - HALF, 0)], axis=1)
+        high = np.stack([W - _first(columns[:, ::-1]) + HALF, H - _first(rows[:, ::-1]) + HALF], axis=1)
+        w, h = np.minimum(np.max(high - low, axis=0), (W, H))
+        low = np.minimum(low, (W - w, H - h))
+        parts = [(slice(y, y + h), slice(x, x + w)) for x, y in low]
+        P = views.projections.astype(float)
+        focal = np.sqrt(np.abs(np.linalg.det(P[:, :, :3])))
+        P = np.concatenate([P[:, :, :3] * length, P[:, :, :3] @ o[:, None] + P[:, :, 3:]], axis=2)
+        P[:, :2] -= low[:, :, None] * P[:, 2:]
+        return cls(
+            np.stack([views.levels[(slice(None), c, *part)] for c, part in enumerate(parts)], axis=1),
+            np.stack([views.masks[(c, *part)] for c, part in enumerate(parts)]),
+            np.stack([views.depth[(c, *part)] for c, part in enumerate(parts)]),
+            np.ascontiguousarray(P),
+            -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[:, :, 0],
+            _HIDING * views.voxel_size,
+            focal,
+            length,
+        )
+
+    def look(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How squarely each camera sees points (S, 3) with normals, (S, C) cosine, 0 where hidden; pixels' size there.
+
+        The size of a pixel, (S, C), is in the surface's unit.
+        """
+        P = self.projections
+        place = np.einsum("cij,sj->sci", P[:, :, :3], points) + P[:, :, 3]
+        depth = np.maximum(place[..., 2], 1e-9)
+        pixel = np.rint(place[..., :2] / depth[..., None])
+        h, w = self.depth.shape[1:]
+        inside = (place[..., 2] > 0) & (pixel >= 0).all(axis=2) & (pixel[..., 0] < w) & (pixel[..., 1] < h)
+        x, y = (np.where(inside, pixel[..., k], 0).astype(int) for k in range(2))
+        surface = self.depth[np.arange(len(P))[None], y, x]
+        ray = self.centers - points[:, None]
+        cosine = (ray * normals[:, None]).sum(axis=2) / np.linalg.norm(ray, axis=2)
+        seen = inside & np.isfinite(surface) & (depth < surface + self.hiding) & (cosine > LEAST_COSINE)
+        return np.where(seen, cosine, 0.0), depth / self.focal / self.length
+
+
+def _first(flags: np.ndarray) -> np.ndarray:
+    """Index of the first True of each row, 0 where there is none."""
+    return flags.argmax(axis=1)
+
+
+@njit(cache=True, nogil=True)
+def _value(image, x, y):
+    j, i = int(x), int(y)
+    a, b = x - j, y - i
+    return (1 - b) * ((1 - a) * image[i, j] + a * image[i, j + 1]) + b * (
+        (1 - a) * image[i + 1, j] + a * image[i + 1, j + 1]
+    )
+
+
+@njit(cache=True, nogil=True)
+def window_pulls(now, then, P, Q, mask_now, mask_then, y, e, y0, e0, step, seen, half, A, b, error, count):
+    """Gather what the windows of all samples in all cameras ask, with σ = 1.
+
+    Parameters
+    ----------
+    now, then : (C, h, w), (C, h', w') float32
+        Images of this frame and of the earlier one.
+    P, Q : (C, 3, 4) float
+        Their projections.
+    mask_now, mask_then : (C, h, w), (C, h', w') uint8
+    y, e : (S, 3), (S, 2, 3) float
+        Samples of this frame's surface and two axes of their tangent planes.
+    y0, e0 : (S, 3), (S, 2, 3) float
+        The same of the earlier frame.
+    step : (S, C) float
+        Distance of a window's pixels on the surface.
+    seen : (S, C) bool
+        Which windows to compare.
+    half : int
+    A, b : (S, C, 3, 3), (S, C, 3) float, out
+        Weights of the samples' places, and these times their errors.
+    error : (S, C) float, out
+        Sum of the squared differences.
+    count : (S, C) int, out
+        Pixels compared; 0: too few.
+    """
+    size = (2 * half + 1) ** 2
+    g = np.empty((size, 3))
+    r = np.empty(size)
+    for s in range(len(y)):
+        for c in range(len(P)):
+            count[s, c] = 0
+            if not seen[s, c]:
+                continue
+            height, width = mask_now.shape[1:]
+            height0, width0 = mask_then.shape[1:]
+            n = 0
+            mr, m0, m1, m2 = 0.0, 0.0, 0.0, 0.0
+            for i in range(-half, half + 1):
+                for j in range(-half, half + 1):
+                    di, dj = step[s, c] * i, step[s, c] * j
+                    X = y0[s, 0] + di * e0[s, 0, 0] + dj * e0[s, 1, 0]
+                    Y = y0[s, 1] + di * e0[s, 0, 1] + dj * e0[s, 1, 1]
+                    Z = y0[s, 2] + di * e0[s, 0, 2] + dj * e0[s, 1, 2]
+                    w = Q[c, 2, 0] * X + Q[c, 2, 1] * Y + Q[c, 2, 2] * Z + Q[c, 2, 3]
+                    if w <= 0:
+                        continue
+                    u = (Q[c, 0, 0] * X + Q[c, 0, 1] * Y + Q[c, 0, 2] * Z + Q[c, 0, 3]) / w
+                    v = (Q[c, 1, 0] * X + Q[c, 1, 1] * Y + Q[c, 1, 2] * Z + Q[c, 1, 3]) / w
+                    if not (u >= 0 and v >= 0 and u < width0 - 1 and v < height0 - 1):
+                        continue
+                    if mask_then[c, int(v + 0.5), int(u + 0.5)] == 0:
+                        continue
+                    before = _value(then[c], u, v)
+                    X = y[s, 0] + di * e[s, 0, 0] + dj * e[s, 1, 0]
+                    Y = y[s, 1] + di * e[s, 0, 1] + dj * e[s, 1, 1]
+                    Z = y[s, 2] + di * e[s, 0, 2] + dj * e[s, 1, 2]
+                    w = P[c, 2, 0] * X + P[c, 2, 1] * Y + P[c, 2, 2] * Z + P[c, 2, 3]
+                    if w <= 0:
+                        continue
+                    u = (P[c, 0, 0] * X + P[c, 0, 1] * Y + P[c, 0, 2] * Z + P[c, 0, 3]) / w
+                    v = (P[c, 1, 0] * X + P[c, 1, 1] * Y + P[c, 1, 2] * Z + P[c, 1, 3]) / w
+                    if not (u >= 1 and v >= 1 and u < width - 2 and v < height - 2):
+                        continue
+                    if mask_now[c, int(v + 0.5), int(u + 0.5)] == 0:
+                        continue
+                    gx = 0.5 * (_value(now[c], u + 1, v) - _value(now[c], u - 1, v)) / w
+                    gy = 0.5 * (_value(now[c], u, v + 1) - _value(now[c], u, v - 1)) / w
+                    r[n] = _value(now[c], u, v) - before
+                    for k in range(3):
+                        g[n, k] = gx * (P[c, 0, k] - u * P[c, 2, k]) + gy * (P[c, 1, k] - v * P[c, 2, k])
+                    mr += r[n]
+                    m0 += g[n, 0]
+                    m1 += g[n, 1]
+                    m2 += g[n, 2]
+                    n += 1
+            if n < _LEAST_FILLED * size:
+                continue
+            count[s, c] = n
+            mr, m0, m1, m2 = mr / n, m0 / n, m1 / n, m2 / n
+            total = 0.0
+            b0, b1, b2 = 0.0, 0.0, 0.0
+            a00, a01, a02, a11, a12, a22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for k in range(n):
+                g0, g1, g2, d = g[k, 0] - m0, g[k, 1] - m1, g[k, 2] - m2, r[k] - mr
+                total += d * d
+                b0 += g0 * d
+                b1 += g1 * d
+                b2 += g2 * d
+                a00 += g0 * g0
+                a01 += g0 * g1
+                a02 += g0 * g2
+                a11 += g1 * g1
+                a12 += g1 * g2
+                a22 += g2 * g2
+            error[s, c] = total
+            b[s, c, 0], b[s, c, 1], b[s, c, 2] = b0, b1, b2
+            A[s, c, 0, 0], A[s, c, 1, 1], A[s, c, 2, 2] = a00, a11, a22
+            A[s, c, 0, 1] = A[s, c, 1, 0] = a01
+            A[s, c, 0, 2] = A[s, c, 2, 0] = a02
+            A[s, c, 1, 2] = A[s, c, 2, 1] = a12
