@@ -29,9 +29,10 @@ from geomocap.files.run import Run
 from geomocap.model.ray_casting import TriangleScene
 from geomocap.model.rig import Rig
 from geomocap.model.self_check import SelfCheck
+from geomocap.model.skeleton import Skeleton
 from geomocap.skeleton.kinematics import BodyMotion
 from geomocap.subject.model_mesh import ModelMesh, model_mesh
-from geomocap.subject.subject_model import MODEL_FILE, read_model
+from geomocap.subject.subject_model import MODEL_FILE, SubjectModel, read_model
 
 FRAMES = 6  # evenly spread
 MESH_TRIANGLES = 20000
@@ -55,21 +56,42 @@ def check_run(run: Run, capture: Capture) -> SelfCheck | None:
         return None
     capture = as_seen(run, capture)
     skeleton, mesh = read_skeleton(run), model_mesh(read_model(run.path / MODEL_FILE), MESH_TRIANGLES)
-    undistortion = Undistortion.of(capture.rig)
-    chosen = np.unique(np.linspace(0, len(skeleton.body_rotations) - 1, FRAMES).round().astype(int))
-
-    def views(frame: int) -> PinholeViews:
-        return undistortion.views([read_silhouette(run, camera, frame) for camera in capture.cameras])
-
-    start = skeleton.body_positions[0]
-    shifts = skeleton.body_positions - np.einsum("tbij,bj->tbi", skeleton.body_rotations, start)
-    motion = BodyMotion(skeleton.body_rotations, shifts)
+    motion = _motion(skeleton)
     residual = float("nan")
     if (run.path / "diagnostics.npz").exists():
         found = read_diagnostics(run).sample_residuals
         if found is not None and len(found):
             residual = float(np.median(found)) / float(np.linalg.norm(np.ptp(mesh.surface.vertices, axis=0)))
-    return check_result(capture.cameras, chosen.tolist(), views, capture.rig.undistorted(), mesh, motion, residual)
+    views, rig = _views(run, capture), capture.rig.undistorted()
+    return check_result(capture.cameras, _looks(motion), views, rig, mesh, motion, residual)
+
+
+def model_overlap(run: Run, capture: Capture, model: SubjectModel, skeleton: Skeleton) -> float:
+    """Overlap of a model, drawn in the motion of its skeleton, with a run's silhouettes: the mean over their images.
+
+    It says, without any truth, which of several results for one recording explains the images best.
+    """
+    capture = as_seen(run, capture)
+    mesh, motion, views = model_mesh(model, MESH_TRIANGLES), _motion(skeleton), _views(run, capture)
+    rig = capture.rig.undistorted()
+    return float(np.nanmean([_drawn_overlaps(mesh, motion, views(frame), rig, frame) for frame in _looks(motion)]))
+
+
+def _motion(skeleton: Skeleton) -> BodyMotion:
+    start = skeleton.body_positions[0]
+    shifts = skeleton.body_positions - np.einsum("tbij,bj->tbi", skeleton.body_rotations, start)
+    return BodyMotion(skeleton.body_rotations, shifts)
+
+
+def _looks(motion: BodyMotion) -> list[int]:
+    """Return the frames that are looked at."""
+    return np.unique(np.linspace(0, len(motion.rotations) - 1, FRAMES).round().astype(int)).tolist()
+
+
+def _views(run: Run, capture: Capture) -> Callable[[int], PinholeViews]:
+    """Return what reads the undistorted silhouettes of a frame."""
+    undistortion = Undistortion.of(capture.rig)
+    return lambda frame: undistortion.views([read_silhouette(run, camera, frame) for camera in capture.cameras])
 
 
 def check_result(
@@ -103,12 +125,23 @@ def check_result(
     left_out = np.full_like(model, np.nan)
     for column, frame in enumerate(frames):
         seen = views(frame)
-        placed = motion.part(slice(frame, frame + 1)).carry(mesh.skin.rest, mesh.skin.bodies, mesh.skin.fractions)[0]
-        scene = TriangleScene(placed, mesh.surface.triangles)
-        for c in np.flatnonzero(~seen.blind()):
-            model[c, column] = _drawn_overlap(scene, rig, seen, int(c))
-        left_out[:, column] = _left_out_overlaps(seen, placed)
+        model[:, column] = _drawn_overlaps(mesh, motion, seen, rig, frame)
+        left_out[:, column] = _left_out_overlaps(seen, _placed(mesh, motion, frame))
     return SelfCheck(tuple(cameras), np.asarray(frames), model, left_out, float(residual))
+
+
+def _placed(mesh: ModelMesh, motion: BodyMotion, frame: int) -> np.ndarray:
+    """Return the model's surface in a frame, (V, 3) float, metres."""
+    return motion.part(slice(frame, frame + 1)).carry(mesh.skin.rest, mesh.skin.bodies, mesh.skin.fractions)[0]
+
+
+def _drawn_overlaps(mesh: ModelMesh, motion: BodyMotion, seen: PinholeViews, rig: Rig, frame: int) -> np.ndarray:
+    """Overlap of the model in a frame with each camera's silhouette, (C,) float; NaN where a camera is blind."""
+    scene = TriangleScene(_placed(mesh, motion, frame), mesh.surface.triangles)
+    result = np.full(len(seen), np.nan)
+    for c in np.flatnonzero(~seen.blind()):
+        result[c] = _drawn_overlap(scene, rig, seen, int(c))
+    return result
 
 
 def _drawn_overlap(scene: TriangleScene, rig: Rig, views: PinholeViews, camera: int) -> float:

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomocap.evaluation.surface_agreement import surface_disagreement
+from geomocap.errors import GeometryError
+from geomocap.evaluation.result_check import model_overlap
 from geomocap.files.corrected_cameras import camera_warnings
 from geomocap.files.results import write_diagnostics, write_ellipsoids, write_points, write_skeleton, write_warnings
 from geomocap.files.run import Run
@@ -14,11 +15,11 @@ from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.ellipsoids import Ellipsoids, fit_ellipsoids
 from geomocap.model.frame_geometry import BodyPoints, Geometry
 from geomocap.motion import Motion, MotionSettings, find_motion
-from geomocap.nodes.surface_coverage import looks, piece_reach
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.path_choice import motion_paths
 from geomocap.pipeline.subject_stage import make_model
 from geomocap.scheduling import map_items
+from geomocap.subject.model_building import BodyCloud, build_model
 
 
 def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
@@ -36,7 +37,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
             source: find_motion(paths, fps=job.fps, settings=settings, progress=job.progress)
             for source, paths in choice.items()
         }
-        source = _best(found_from, geometry)
+        source = _best(job, found_from, geometry)
         motion = found_from[source]
         count["items"] = frames
     bodies, found = motion.bodies, motion.connected
@@ -67,18 +68,26 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     return frames
 
 
-def _best(found: dict[str, Motion], geometry: Geometry) -> str:
-    """Which motion's bodies carry the surface of each frame best onto that of the others."""
-    if len(found) < 2:
+def _best(job: Job, found: dict[str, Motion], geometry: Geometry) -> str:
+    """Which motion's model, drawn into the cameras, explains their silhouettes best."""
+    if len(found) < 2 or job.capture is None:
         return next(iter(found))
-    reach, frames = piece_reach(geometry.points(0)), looks(len(geometry))
+    capture = job.capture
 
-    def disagreement(source: str) -> float:
+    def overlap(source: str) -> float:
         motion = found[source]
-        bodies = motion.bodies
-        return surface_disagreement(geometry.points, motion.label, bodies.rotations, bodies.translations, frames, reach)
 
-    return min(found, key=disagreement)
+        def read(frame: int) -> BodyCloud:
+            points = geometry.points(frame)
+            return BodyCloud(points, motion.label(frame, points))
+
+        try:
+            model = build_model(motion.connected, motion.bodies, read, geometry.spacing, job.up_axis)
+        except GeometryError:
+            return 0.0
+        return model_overlap(job.run, capture, model, motion.skeleton)
+
+    return max(found, key=overlap)
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ ANCHOR_FRACTION = 0.1  # those are measured in this fraction of the frames at le
 
 
 def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, MotionPaths]:
-    """Motion paths by what they are; where there is a choice, whichever makes the bodies that carry the surface best.
+    """Motion paths by what they are; where there is a choice, bodies tell which are best.
 
     They are "patches", "nodes", "both" (nodes held by patches and images), "pieces" (patches, and where these leave
     pieces of the surface uncovered, such nodes), "points" or "ellipsoids". Nodes are followed only where some piece
