@@ -13,6 +13,7 @@ import numpy as np
 
 from geomocap.calibration.silhouette_correction import correct_cameras
 from geomocap.calibration.silhouette_tangents import OutlineRays
+from geomocap.evaluation.camera_check import BACKGROUND_FRAMES
 from geomocap.files.capture import Capture
 from geomocap.files.corrected_cameras import CORRECTION, SPARSE_FILES, as_seen, write_cameras
 from geomocap.files.run import stage_key
@@ -51,7 +52,7 @@ def with_cameras(job: Job) -> tuple[Job, str]:
         write_cameras(job.run, find_correction(job, capture))
         return len(capture.cameras)
 
-    job.write_record("silhouettes")
+    job.run.claim()
     job.stage("correction", key, [], work, [CORRECTION, *SPARSE_FILES])
     return replace(job, capture=as_seen(job.run, capture)), key
 
@@ -59,6 +60,9 @@ def with_cameras(job: Job) -> tuple[Job, str]:
 def find_correction(job: Job, capture: Capture) -> CameraCorrection:
     """Hold the calibration against the outlines of frames spread over the recording."""
     rig = capture.rig
+    plates = all(map(capture.has_background, capture.cameras))
+    if not (capture.has_masks or plates or capture.n_recorded >= BACKGROUND_FRAMES):
+        return CameraCorrection(rig, rig, np.nan, np.nan)  # there are no silhouettes
     shrink = 1 if capture.has_masks else max(1, round(int(rig.sizes.max()) / LONGEST))
     chosen = np.unique(np.linspace(0, capture.n_frames - 1, min(OUTLINES, capture.n_frames)).round().astype(int))
     if capture.has_masks:
