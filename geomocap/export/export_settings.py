@@ -32,7 +32,6 @@ class ExportSettings(Settings):
         None,
         ge=0,
         description="frame in which all joint angles are zero; by default straight limbs have none",
-        json_schema_extra={"flag": "zero-frame"},
     )
     density: float = Field(
         1000.0, gt=0, description="density that gives OpenSim's and URDF's bodies their mass (kg/m³)"
