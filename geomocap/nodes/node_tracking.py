@@ -31,6 +31,9 @@ from geomocap.scheduling import map_items, threads
 Points = Callable[[int], np.ndarray]
 """Points of a frame, (M, 3) float, metres; or their features, (M, F) float."""
 
+NodeFit = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Places, rotations and covariances of the nodes in a frame, and which are lost."""
+
 FINE = ((1.0, 2.0), (0.8, 1.0), (0.6, 1.0), (0.6, 1.0))
 """Scales in node spacings and stiffness of the fine fit, step by step."""
 USUAL_NOISE = 0.035
@@ -58,6 +61,8 @@ class NodeTracks:
         Neighbours on the surface.
     parts : (N,) int, optional
         Rigid part of each node, if they were followed as parts.
+    geometric : NodeTracks, optional
+        The same nodes followed in the geometry alone, if images were given.
     """
 
     positions: np.ndarray
@@ -67,6 +72,7 @@ class NodeTracks:
     reference: np.ndarray
     edges: np.ndarray
     parts: np.ndarray | None = None
+    geometric: NodeTracks | None = None
 
     @property
     def sigma(self) -> np.ndarray:
@@ -280,21 +286,33 @@ def track_nodes(
         return model.refine(target, states[frame], homes[frame], known[:, frame])
 
     fine = list(map_items(refine, list(range(n_frames)), executor, "nodes", progress))
+    blind = None
     if images is not None:
+        blind = _tracks(model, fine, reference, unit)
         geometric = [(f[0], f[1]) for f in fine]
         fine = _followed_in_images(model, frames, geometric, reference, images, unit, executor, progress)
-    x, R, covariance, lost = (np.stack([f[k] for f in fine], axis=1) for k in range(4))
-    parts = None
+    tracks = _tracks(model, fine, reference, unit)
     if settings.part_rounds and not len(known) and images is None:
         targets = [Target(frame, scales, settings.normal_weight) for frame in frames]
+        x, R = (np.stack([f[k] for f in fine], axis=1) for k in range(2))
         found, covariance = find_rigid_parts(
             model.graph, targets, x, R, reference, 1.5 * model.spacing, settings, executor
         )
+        lost = np.isnan(tracks.positions)
         x, R = found.carry(model.graph.nodes)
-        parts = found.label
+        positions = np.where(lost, np.nan, unit.back(x))
+        return replace(
+            tracks, positions=positions, rotations=R, covariance=unit.length**2 * covariance, parts=found.label
+        )
+    return replace(tracks, geometric=blind)
+
+
+def _tracks(model: NodeModel, frames: list[NodeFit], reference: int, unit: Unit) -> NodeTracks:
+    """Put the nodes' positions, rotations, covariances, and which are lost, of all frames together, in metres."""
+    x, R, covariance, lost = (np.stack([f[k] for f in frames], axis=1) for k in range(4))
     x[lost] = np.nan
     places = unit.back(model.graph.nodes)
-    return NodeTracks(unit.back(x), R, unit.length**2 * covariance, reference, places, model.graph.edges, parts)
+    return NodeTracks(unit.back(x), R, unit.length**2 * covariance, reference, places, model.graph.edges)
 
 
 def _followed_in_images(
@@ -306,7 +324,7 @@ def _followed_in_images(
     unit: Unit,
     executor: Executor,
     progress: Progress,
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+) -> list[NodeFit]:
     """Follow the fine graph in points and images; positions, rotations, covariances, which are lost, of each frame."""
     settings = model.settings
     targets = [Target(f, np.full(f.features.shape[1], settings.feature_scale), settings.normal_weight) for f in frames]

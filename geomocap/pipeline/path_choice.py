@@ -14,7 +14,7 @@ from geomocap.files.scans import Scans
 from geomocap.model.frame_geometry import Geometry
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.trajectories import Trajectories
-from geomocap.nodes.node_tracking import track_nodes
+from geomocap.nodes.node_tracking import NodeTracks, track_nodes
 from geomocap.nodes.surface_coverage import SMALLEST_PIECE, left_over, piece_reach, uncovered_fraction
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.track_stage import frame_reader
@@ -33,8 +33,8 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
     """Motion paths by what they are; where there is a choice, bodies tell which are best.
 
     They are "patches", "nodes", "both" (nodes held by patches and images), "pieces" (patches, and where these leave
-    pieces of the surface uncovered, such nodes), "points" or "ellipsoids". Nodes are followed only where some piece
-    needs them; then "pieces" and "both" are returned.
+    pieces of the surface uncovered, nodes held by them), "points" or "ellipsoids". Nodes are followed only where some
+    piece needs them; then "pieces" and "both" are returned.
 
     Parameters
     ----------
@@ -73,14 +73,16 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
         if uncovered_fraction(geometry.points, patches.positions, reach) < SMALLEST_PIECE:
             return {"patches": patches}
     nodes = _follow_nodes(job, geometry, None if tracked is None else _anchors(tracked))
-    if patches is None:
-        return {"nodes": nodes} if tracked is None else {"both": replace(nodes, sigma=None)}
-    rest = left_over(nodes.positions, patches.positions, reach)
     # nodes that images hold are as precise as their neighbourhood shows; the geometry doesn't know it
-    return {"pieces": _joined(patches, nodes, rest), "both": replace(nodes, sigma=None)}
+    held = nodes.motion_paths() if nodes.geometric is None else replace(nodes.motion_paths(), sigma=None)
+    if patches is None:
+        return {"nodes" if tracked is None else "both": held}
+    blind = (nodes.geometric or nodes).motion_paths()
+    rest = left_over(blind.positions, patches.positions, reach)
+    return {"pieces": _joined(patches, blind, rest), "both": held}
 
 
-def _follow_nodes(job: Job, geometry: Geometry, anchors: np.ndarray | None) -> MotionPaths:
+def _follow_nodes(job: Job, geometry: Geometry, anchors: np.ndarray | None) -> NodeTracks:
     """Follow nodes of the geometry, which `anchors` (P, T, 3), metres, keep from sliding."""
     features = geometry.features if job.config.nodes.colors else None
     following = job.config.nodes
@@ -89,10 +91,7 @@ def _follow_nodes(job: Job, geometry: Geometry, anchors: np.ndarray | None) -> M
     images = None
     if job.capture is not None and anchors is not None:
         images = frame_reader(as_seen(job.run, job.capture), job.run, job.config.tracking)
-    nodes = track_nodes(
-        geometry.points, len(geometry), following, features, job.progress, job.executor, anchors, images
-    )
-    return nodes.motion_paths()
+    return track_nodes(geometry.points, len(geometry), following, features, job.progress, job.executor, anchors, images)
 
 
 def point_paths(job: Job, geometry: Geometry) -> MotionPaths | None:
