@@ -74,7 +74,8 @@ def model_overlap(run: Run, capture: Capture, model: SubjectModel, skeleton: Ske
     capture = as_seen(run, capture)
     mesh, motion, views = model_mesh(model, MESH_TRIANGLES), _motion(skeleton), _views(run, capture)
     rig = capture.rig.undistorted()
-    return float(np.nanmean([_drawn_overlaps(mesh, motion, views(frame), rig, frame) for frame in _looks(motion)]))
+    drawn = np.array([_drawn_overlaps(mesh, motion, views(frame), rig, frame) for frame in _looks(motion)])
+    return float(np.nanmean(drawn))
 
 
 def _motion(skeleton: Skeleton) -> BodyMotion:

@@ -15,6 +15,7 @@ from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.ellipsoids import Ellipsoids, fit_ellipsoids
 from geomocap.model.frame_geometry import BodyPoints, Geometry
 from geomocap.motion import Motion, MotionSettings, find_motion
+from geomocap.nodes.surface_coverage import SMALLEST_PIECE
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.path_choice import motion_paths
 from geomocap.pipeline.subject_stage import make_model
@@ -69,7 +70,10 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
 
 
 def _best(job: Job, found: dict[str, Motion], geometry: Geometry) -> str:
-    """Which motion's model, drawn into the cameras, explains their silhouettes best."""
+    """Which motion's model, drawn into the cameras, explains their silhouettes best.
+
+    What is less than the smallest piece that counts as a body of its own is no reason for more bodies.
+    """
     if len(found) < 2 or job.capture is None:
         return next(iter(found))
     capture = job.capture
@@ -87,7 +91,10 @@ def _best(job: Job, found: dict[str, Motion], geometry: Geometry) -> str:
             return 0.0
         return model_overlap(job.run, capture, model, motion.skeleton)
 
-    return max(found, key=overlap)
+    explained = {source: overlap(source) for source in found}
+    enough = max(explained.values()) - SMALLEST_PIECE
+    good = [source for source in found if explained[source] > enough]
+    return min(good, key=lambda source: (found[source].body_count, -explained[source]))
 
 
 @dataclass(frozen=True)
