@@ -11,6 +11,22 @@ from geomocap.nodes.node_graph import NodeGraph
 
 
 @dataclass(frozen=True)
+class Anchors:
+    """Points of the surface whose paths are known.
+
+    Attributes
+    ----------
+    positions : (P, T, 3) float
+        In the unit that nodes are followed in; NaN where not known.
+    sigma : (P, T) float
+        Standard deviation of a coordinate, in that unit.
+    """
+
+    positions: np.ndarray
+    sigma: np.ndarray
+
+
+@dataclass(frozen=True)
 class AnchorPoints:
     """Points of the surface whose places in a frame are known.
 
@@ -22,14 +38,19 @@ class AnchorPoints:
         From the mark to its sample, in the reference frame.
     position : (K, 3) float, metres, world
         Where the mark is in the frame.
+    precision : (K,) float
+        One over the variance of a coordinate, or 1 where that isn't known.
     """
 
     sample: np.ndarray
     offset: np.ndarray
     position: np.ndarray
+    precision: np.ndarray
 
     @classmethod
-    def of(cls, graph: NodeGraph, homes: np.ndarray, positions: np.ndarray) -> AnchorPoints:
+    def of(
+        cls, graph: NodeGraph, homes: np.ndarray, positions: np.ndarray, sigma: np.ndarray | None = None
+    ) -> AnchorPoints:
         """Hang marks on a graph.
 
         Parameters
@@ -37,13 +58,16 @@ class AnchorPoints:
         graph : NodeGraph
         homes, positions : (P, 3) float, metres
             In the reference frame and in the frame; NaN where not known.
+        sigma : (P,) float, optional
+            Standard deviation of a coordinate of the positions.
         """
         known = np.isfinite(homes[:, 0]) & np.isfinite(positions[:, 0])
         home = homes[known]
         distance, sample = cKDTree(graph.samples).query(home)
         near = distance < graph.spacing
         sample = sample[near].astype(int)
-        return cls(sample, graph.samples[sample] - home[near], positions[known][near])
+        precision = np.ones(len(sample)) if sigma is None else 1 / sigma[known][near] ** 2
+        return cls(sample, graph.samples[sample] - home[near], positions[known][near], precision)
 
     def add_to(
         self, A: np.ndarray, b: np.ndarray, graph: NodeGraph, x: np.ndarray, R: np.ndarray, weight: float, scale: float
@@ -55,13 +79,13 @@ class AnchorPoints:
         x, R : (N, 3), (N, 3, 3) float
             State of the nodes.
         weight : float
-            Relative to that of a point.
+            Of a precision of 1, relative to that of a point.
         scale : float
             Distance at which a mark loses its weight, metres.
         """
         y, turn = carried(graph, self.sample, x, R)
         error = y - self.position - np.einsum("kij,kj->ki", turn, self.offset)
-        w = weight / (1 + (error**2).sum(axis=1) / scale**2) ** 2
+        w = weight * self.precision / (1 + (error**2).sum(axis=1) / scale**2) ** 2
         np.add.at(A, self.sample, w[:, None, None] * np.eye(3))
         np.add.at(b, self.sample, w[:, None] * error)
 

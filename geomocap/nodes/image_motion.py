@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geomocap.model.rotations import nearest_rotation
+from geomocap.nodes.anchors import AnchorPoints, Anchors, find_homes
 from geomocap.nodes.correspondences import Target, pull
 from geomocap.nodes.deformation import BlockPattern, step
 from geomocap.nodes.image_pull import HALF, LEAST_COSINE, FrameImages, window_pulls
@@ -26,6 +27,7 @@ _STEPS = (3, 3)  # on coarse and on fine images
 _SPREAD = (3.0, 1.0)  # pixels between those of a window, on coarse and on fine images
 _NORMAL = 1.4826  # standard deviation of a normal distribution, from its median distance
 _DEPARTED = 3.0  # squared differences of so many times the median lose three quarters of their weight
+_TORN = 1e-3  # of its stiffness a torn edge keeps: a node that nothing else holds stays beside its neighbours
 _CORRELATED = 0.3  # of the points' pull is counted: a hull's errors are alike over a piece of it
 
 NodeState = tuple[np.ndarray, np.ndarray]
@@ -73,6 +75,7 @@ class ImageMotion:
         geometric: list[NodeState],
         reference: int,
         way: int,
+        known: Anchors,
     ) -> list[NodeState]:
         """Follow the graph from the reference frame on, forwards (way 1) or backwards (way −1).
 
@@ -87,6 +90,8 @@ class ImageMotion:
         geometric : list of NodeState
             All frames, followed in the geometry alone.
         reference, way : int
+        known : Anchors
+            Nodes near them don't slide.
 
         Returns
         -------
@@ -96,15 +101,19 @@ class ImageMotion:
         g = self.graph
         states: list[NodeState] = [(g.nodes, np.tile(np.eye(3), (len(g.nodes), 1, 1)))]
         seen = [self._seen(read(reference), states[0])]
+        homes = known.positions[:, reference].copy()
         for t in range(reference + way, len(frames) if way > 0 else -1, way):
             images = read(t)
             earlier = [seen[-k] for k in EARLIER if k <= len(seen)]
             starts = [_carried(geometric[t - way], geometric[t], states[-1], g.spacing)]
             if len(states) > 1:
                 starts.insert(0, _continued(states[-2], states[-1]))
-            found = [self._fit(frames[t], images, earlier, start, 0) for start in starts]
+            marks = AnchorPoints.of(g, homes, known.positions[:, t], known.sigma[:, t])
+            found = [self._fit(frames[t], images, earlier, marks, start, 0) for start in starts]
             best = found[0][0] if len(found) < 2 else self._better(frames[t], found)
-            states.append(self._fit(frames[t], images, earlier, best, 1)[0])
+            states.append(self._fit(frames[t], images, earlier, marks, best, 1)[0])
+            new = np.isnan(homes[:, 0])
+            homes[new] = find_homes(g, *states[-1], known.positions[new, t])
             seen = [*seen[-max(EARLIER) + 1 :], self._seen(images, states[-1])]
         return states
 
@@ -143,7 +152,13 @@ class ImageMotion:
         return np.ascontiguousarray(np.einsum("sij,skj->ski", turn, np.stack([first, np.cross(n, first)], axis=1)))
 
     def _fit(
-        self, frame: Target, images: FrameImages, earlier: list[_Earlier], start: NodeState, level: int
+        self,
+        frame: Target,
+        images: FrameImages,
+        earlier: list[_Earlier],
+        marks: AnchorPoints,
+        start: NodeState,
+        level: int,
     ) -> tuple[NodeState, np.ndarray]:
         """Fit on images of a level; the state, and the mean squared difference of each window, NaN where not seen."""
         x, R = start
@@ -158,7 +173,8 @@ class ImageMotion:
             A, b = _CORRELATED * found.A, _CORRELATED * found.b
             noise = max(_NORMAL * float(np.median(np.abs(found.across))), 0.3 * self.point_spacing)
             errors = self._add_images(A, b, noise, images, earlier, y, normals, self._axes(R), level)
-            soft = 1 / (1 + (g.strain(x, R) / self.give) ** 2) ** 2
+            marks.add_to(A, b, g, x, R, noise**2, c)
+            soft = np.maximum(1 / (1 + (g.strain(x, R) / self.give) ** 2) ** 2, _TORN)
             x, R = step(g, self.pattern, x, R, self.stiffness * fraction * soft, A, b, 60)
         return (x, R), errors
 

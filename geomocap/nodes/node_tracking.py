@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.rotations import nearest_rotation
-from geomocap.nodes.anchors import AnchorPoints
+from geomocap.nodes.anchors import AnchorPoints, Anchors
 from geomocap.nodes.coarse_motion import CoarseModel, CoarseTarget, State, follow, mend
 from geomocap.nodes.correspondences import Target, pull
 from geomocap.nodes.deformation import block_pattern, step
@@ -205,7 +205,7 @@ def track_nodes(
     features: Points | None = None,
     progress: Progress = silent,
     executor: Executor | None = None,
-    anchors: np.ndarray | None = None,
+    anchors: MotionPaths | None = None,
     images: Callable[[int], Views] | None = None,
 ) -> NodeTracks:
     """Follow nodes of a surface through all frames, forwards and backwards from the most open one.
@@ -221,9 +221,8 @@ def track_nodes(
     progress : callable, optional
     executor : Executor, optional
         Threads; the cores' number of them if not given.
-    anchors : (P, T, 3) float, metres, optional
-        Trajectories of points of the surface that are known from elsewhere, NaN where they are not: nodes near them do
-        not slide.
+    anchors : MotionPaths, optional
+        P points of the surface whose paths are known from elsewhere: nodes near them do not slide.
     images : callable, optional
         `images(frame)`, what the cameras see: nodes move as it does.
 
@@ -271,7 +270,7 @@ def track_nodes(
         )
 
     coarse = list(map_items(coarsen, list(range(n_frames)), executor, "ends of limbs", progress))
-    known = np.zeros((0, n_frames, 3)) if anchors is None else unit.to(np.asarray(anchors, float))
+    known = np.zeros((0, n_frames, 3)) if anchors is None else unit.to(anchors.positions)
     (ahead, homes_ahead), (back, homes_back) = map_items(
         lambda way: follow(model.coarse, coarse, reference, way, known), [1, -1], executor, "coarse motion", progress
     )
@@ -290,7 +289,8 @@ def track_nodes(
     if images is not None:
         blind = _tracks(model, fine, reference, unit)
         geometric = [(f[0], f[1]) for f in fine]
-        fine = _followed_in_images(model, frames, geometric, reference, images, unit, executor, progress)
+        measured = _measured(anchors, known, unit)
+        fine = _followed_in_images(model, frames, geometric, reference, measured, images, unit, executor, progress)
     tracks = _tracks(model, fine, reference, unit)
     if settings.part_rounds and not len(known) and images is None:
         targets = [Target(frame, scales, settings.normal_weight) for frame in frames]
@@ -315,11 +315,20 @@ def _tracks(model: NodeModel, frames: list[NodeFit], reference: int, unit: Unit)
     return NodeTracks(unit.back(x), R, unit.length**2 * covariance, reference, places, model.graph.edges)
 
 
+def _measured(anchors: MotionPaths | None, positions: np.ndarray, unit: Unit) -> Anchors:
+    """Anchors with `positions` (P, T, 3) in `unit`; none of those whose precision isn't known."""
+    if anchors is None or anchors.sigma is None:
+        return Anchors(positions[:0], np.zeros((0, positions.shape[1])))
+    sigma = anchors.sigma if anchors.sigma.ndim == 2 else anchors.sigma[:, None]
+    return Anchors(positions, np.broadcast_to(sigma / unit.length, positions.shape[:2]))
+
+
 def _followed_in_images(
     model: NodeModel,
     frames: list[PointSet],
     geometric: list[NodeState],
     reference: int,
+    known: Anchors,
     images: Callable[[int], Views],
     unit: Unit,
     executor: Executor,
@@ -335,6 +344,7 @@ def _followed_in_images(
             geometric,
             reference,
             way,
+            known,
         ),
         [1, -1],
         executor,

@@ -82,8 +82,8 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
     return {"pieces": _joined(patches, blind, rest), "both": held}
 
 
-def _follow_nodes(job: Job, geometry: Geometry, anchors: np.ndarray | None) -> NodeTracks:
-    """Follow nodes of the geometry, which `anchors` (P, T, 3), metres, keep from sliding."""
+def _follow_nodes(job: Job, geometry: Geometry, anchors: MotionPaths | None) -> NodeTracks:
+    """Follow nodes of the geometry, which `anchors` keep from sliding."""
     features = geometry.features if job.config.nodes.colors else None
     following = job.config.nodes
     if job.capture is not None:  # the hull changes its shape with the pose: what is rigid doesn't look so
@@ -112,8 +112,11 @@ def point_paths(job: Job, geometry: Geometry) -> MotionPaths | None:
 def patch_paths(tracked: Trajectories) -> MotionPaths | None:
     """Long trajectories, evenly over the surface; None: there are none."""
     chosen = spread_out(tracked.positions, SAMPLES)
-    if not len(chosen):
-        return None
+    return _paths_of(tracked, chosen) if len(chosen) else None
+
+
+def _paths_of(tracked: Trajectories, chosen: np.ndarray) -> MotionPaths:
+    """Motion paths of some trajectories, (K,) int."""
     sigma = tracked.sigma[chosen].astype(float)
     # standard deviations with the median where a sample was not seen
     sigma = np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma))
@@ -133,7 +136,7 @@ def _joined(patches: MotionPaths, nodes: MotionPaths, rest: np.ndarray) -> Motio
     return MotionPaths(positions, sigma=np.concatenate([patches.sigma, nodes.sigma[rest]]))
 
 
-def _anchors(tracked: Trajectories) -> np.ndarray | None:
-    """Trajectories (P, T, 3), metres, that nodes are held by; None: there are none."""
+def _anchors(tracked: Trajectories) -> MotionPaths | None:
+    """Trajectories that nodes are held by; None: there are none."""
     chosen = spread_out(tracked.positions, ANCHORS, ANCHOR_FRACTION)
-    return tracked.positions[chosen] if len(chosen) else None
+    return _paths_of(tracked, chosen) if len(chosen) else None

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from geomocap.model.motion_paths import MotionPaths
 from geomocap.nodes.image_pull import HALF, FrameImages, window_pulls
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.nodes.node_tracking import track_nodes
@@ -81,6 +82,17 @@ def test_images_show_the_turn_of_a_ball_that_geometry_cannot_see(views: list[Bal
     seeing = track_nodes(ball_points, 4, settings, images=lambda k: views[k])
     assert abs(turned_about_z(blind.positions)) < 0.5 * 3 * TURN_DEG
     # windows are 7 pixels of 12.5 mm: a hundredth of a pixel would be 0.01°; held by a rough surface, a tenth is asked
+    assert turned_about_z(seeing.positions) == pytest.approx(3 * TURN_DEG, abs=0.6)
+
+
+def test_paths_known_from_elsewhere_hold_what_images_do_not_show(views: list[BallViews]):
+    plain = [replace(v, levels=np.zeros_like(v.levels)) for v in views]
+    settings = NodeTrackingSettings(nodes=120, coarse_nodes=30, points=1500, coarse_points=300, part_rounds=0)
+    turns = Rotation.from_rotvec(np.outer(TURN_DEG * np.arange(4), [0, 0, 1]), degrees=True)
+    marks = np.stack([turn.apply(ball_points(9)[:150]) for turn in turns], axis=1)
+    marks[::2, 0] = np.nan  # half of them are met later
+    known = MotionPaths(marks, sigma=np.full(marks.shape[:2], 0.001))
+    seeing = track_nodes(ball_points, 4, settings, anchors=known, images=lambda k: plain[k])
     assert turned_about_z(seeing.positions) == pytest.approx(3 * TURN_DEG, abs=0.6)
 
 

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
+from geomocap.model.motion_paths import MotionPaths
 from geomocap.nodes.anchors import find_homes
 from geomocap.nodes.correspondences import Target, gather_pulls, pull
 from geomocap.nodes.deformation import block_pattern, normal_equations, solve_blocks, step
@@ -350,7 +351,8 @@ def test_anchors_show_the_twist_of_a_round_limb():
         return capsule(1200, seed=seed) / [1, 1, 0.7]
 
     def error(anchors: np.ndarray | None) -> tuple[float, float]:
-        t = track_nodes(lambda k: rod(20 + k) @ turns[k].T, 5, skin, anchors=anchors)
+        known = None if anchors is None else MotionPaths(anchors)
+        t = track_nodes(lambda k: rod(20 + k) @ turns[k].T, 5, skin, anchors=known)
         at_rest = t.reference @ turns[t.reference_frame]
         truth = np.einsum("tij,nj->nti", turns, at_rest)
         return float(np.median(np.linalg.norm(t.positions - truth, axis=-1)[:, [0, 4]])), float(np.median(t.sigma))
