@@ -27,6 +27,7 @@ _STEPS = (3, 3)  # on coarse and on fine images
 _SPREAD = (3.0, 1.0)  # pixels between those of a window, on coarse and on fine images
 _NORMAL = 1.4826  # standard deviation of a normal distribution, from its median distance
 _DEPARTED = 3.0  # squared differences of so many times the median lose three quarters of their weight
+_LEAST = 1e-6  # squared grey levels; images that are even differ by less
 _TORN = 1e-3  # of its stiffness a torn edge keeps: a node that nothing else holds stays beside its neighbours
 _CORRELATED = 0.3  # of the points' pull is counted: a hull's errors are alike over a piece of it
 
@@ -122,8 +123,8 @@ class ImageMotion:
 
         Images are compared where both states have them.
         """
-        usual = np.median(np.concatenate([e[np.isfinite(e)] for _, e in found]))
         both = np.logical_and.reduce([np.isfinite(e) for _, e in found])
+        usual = max(float(np.median([e[both] for _, e in found])), _LEAST) if both.any() else 1.0
         costs = []
         for (x, R), errors in found:
             y, normals = self.graph.deform(x, R)
@@ -227,7 +228,7 @@ class ImageMotion:
             if not known.any():
                 continue
             mean = total / np.maximum(count, 1)
-            usual = max(float(np.median(mean[known])), 1e-6)
+            usual = max(float(np.median(mean[known])), _LEAST)
             weight = np.where(known, once / (1 + mean / (_DEPARTED * usual)) ** 2, 0.0) * noise**2 / usual
             A += (weight[..., None, None] * more).sum(axis=1)
             b += (weight[..., None] * pulled).sum(axis=1)
