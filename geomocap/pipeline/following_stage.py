@@ -77,12 +77,7 @@ def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) ->
             job.progress,
         )
         count["items"] = frames
-    label = _Label(geometry, job.run, model, followed.bodies)
-    fitted = list(map_items(label, range(frames), job.executor, "labels", job.progress))
-    job.run.note("segmentation", [job.run.frame_file("bodies", k) for k in range(frames)])
-    write_ellipsoids(job.run, Ellipsoids.stack(fitted, np.arange(model.body_count, dtype=np.int32)))
-    write_skeleton(job.run, _skeleton(model, followed, job.fps))
-    write_model(job.run.path / MODEL_FILE, model.widened(followed.bodies).reposed(followed.bodies, 0))
+    write_followed(job, geometry, model, followed.bodies)
     made = Diagnostics(
         paths="model",
         fit_distance=followed.distance,
@@ -96,9 +91,20 @@ def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) ->
     return frames
 
 
-def _skeleton(model: SubjectModel, followed: FollowedSequence, fps: float) -> Skeleton:
-    linkage, motion = posed(model.linkage, followed.bodies, 0), since(followed.bodies, 0)
-    start = followed.bodies.part(slice(0, 1)).carry(model.points, model.skin_bodies, model.skin_weights)[0]
+def write_followed(job: Job, geometry: Geometry, model: SubjectModel, bodies: BodyMotion) -> None:
+    """Write bodies of all points, ellipsoids, skeleton, and the model, by a model's motion."""
+    frames = range(len(geometry))
+    fitted = list(map_items(_Label(geometry, job.run, model, bodies), frames, job.executor, "labels", job.progress))
+    job.run.note("segmentation", [job.run.frame_file("bodies", k) for k in frames])
+    write_ellipsoids(job.run, Ellipsoids.stack(fitted, np.arange(model.body_count, dtype=np.int32)))
+    write_skeleton(job.run, model_skeleton(model, bodies, job.fps))
+    write_model(job.run.path / MODEL_FILE, model.widened(bodies).reposed(bodies, 0))
+
+
+def model_skeleton(model: SubjectModel, bodies: BodyMotion, fps: float) -> Skeleton:
+    """Skeleton of a model that moves."""
+    linkage, motion = posed(model.linkage, bodies, 0), since(bodies, 0)
+    start = bodies.part(slice(0, 1)).carry(model.points, model.skin_bodies, model.skin_weights)[0]
     owners = model.skin.body
     own = linkage.hierarchy.body_joints
     places = [start[owners == b] for b in range(model.body_count)]

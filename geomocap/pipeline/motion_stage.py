@@ -17,6 +17,7 @@ from geomocap.model.frame_geometry import BodyPoints, Geometry
 from geomocap.motion import Motion, MotionSettings, find_motion
 from geomocap.nodes.surface_coverage import SMALLEST_PIECE
 from geomocap.pipeline.job import Job
+from geomocap.pipeline.motion_fit import fit_unseen
 from geomocap.pipeline.path_choice import motion_paths
 from geomocap.pipeline.subject_stage import make_model
 from geomocap.scheduling import map_items
@@ -43,11 +44,17 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
         count["items"] = frames
     bodies, found = motion.bodies, motion.connected
     label = _Label(geometry, job.run, motion)
-    fitted = list(map_items(label, range(frames), job.executor, "labels", job.progress))
+    ellipsoids = list(map_items(label, range(frames), job.executor, "labels", job.progress))
     job.run.note("segmentation", [job.run.frame_file("bodies", k) for k in range(frames)])
-    write_ellipsoids(job.run, Ellipsoids.stack(fitted, np.arange(bodies.body_count, dtype=np.int32)))
+    write_ellipsoids(job.run, Ellipsoids.stack(ellipsoids, np.arange(bodies.body_count, dtype=np.int32)))
     write_skeleton(job.run, found.skeleton)
     warnings = [*camera_warnings(job.run), *motion.warnings, *make_model(job, geometry, motion)]
+    axes = np.array([joint.axis for joint in found.joints]).reshape(-1, 3)
+    fitted = fit_unseen(job, geometry, motion, choice[source])
+    if fitted is not None:
+        unseen = int((motion.bodies.reliability == 0).any(axis=1).sum())
+        warnings.append(f"In {unseen} of {frames} frames no path shows some body; the model was fitted to the surface.")
+        axes = fitted.axes
     if warnings:
         write_warnings(job.run, warnings)
     made = Diagnostics(
@@ -59,7 +66,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
         reliability=bodies.reliability,
         joint_costs=found.costs,
         joint_is_hinge=motion.joint_is_hinge,
-        joint_axes=np.array([joint.axis for joint in found.joints]).reshape(-1, 3),
+        joint_axes=axes,
         joint_std=np.array([joint.std for joint in found.joints]).reshape(-1, 3),
         curve_bodies=np.array([step.bodies for step in bodies.curve]),
         curve_strengths=np.array([step.strength for step in bodies.curve]),

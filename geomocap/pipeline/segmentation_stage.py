@@ -44,7 +44,7 @@ def segment(job: Job, source: Source) -> str:
         return segment_with_model(job, geometry, source_key)
     by_motion = config.segmentation.method == "motion" and len(geometry) > 1
     has_tracks = by_motion and _is_tracked(job, source)
-    tables = ("nodes", "motion_bodies", "motion_skeleton", "refinement") if by_motion else ("skeleton",)
+    tables = ("nodes", "motion_bodies", "motion_skeleton", "refinement", "following") if by_motion else ("skeleton",)
     settings = {name: getattr(config, name).model_dump() for name in ("segmentation", *tables)}
     outputs, optional = ["ellipsoids.npz", "bodies", "diagnostics.npz"], [MODEL_FILE, WARNINGS]
     # a single frame has no motion to tell bodies and joints by

@@ -1,4 +1,7 @@
-"""Another sequence of a known subject: its model is found in a frame, followed, and fitted to all frames together."""
+"""A known subject in a sequence: its model is found in a frame, followed, and fitted to all frames together.
+
+The same fit measures a motion that was found without the model wherever paths don't show it.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +28,7 @@ from geomocap.subject.surface_matching import (
     ModelSurface,
     distance_between,
     match_surfaces,
+    misfit,
 )
 
 _STAGE = "model"
@@ -85,18 +89,8 @@ def follow_model(
         If a frame holds too few points.
     """
     settings = settings or FollowingSettings()
-    diagonal = model.diagonal
-    scales = MatchingScales(
-        settings.normal * diagonal,
-        settings.color * diagonal,
-        settings.reach * diagonal,
-        max(spacing, model.spacing / 2),
-        settings.along,
-        settings.independence,
-    )
-    views = [_view(*read(t), t, spacing, scales, settings.points) for t in range(frames)]
-    colored = all(v.sought.colors is not None for v in views)
-    surface = ModelSurface.of_model(model, settings.points, colored)
+    sequence = _Sequence.of(model, read, frames, spacing, settings)
+    surface, views, scales = sequence.surface, sequence.views, sequence.scales
     # Where it is
     asked = np.unique(np.linspace(0, frames, settings.start_frames, endpoint=False).astype(int)).tolist()
     best, pose = find_pose(model, surface, [views[t] for t in asked], scales, up)
@@ -107,17 +101,110 @@ def follow_model(
     for order in (range(first + 1, frames), range(first - 1, -1, -1)):
         for t in order:
             back = 1 if order.step > 0 else -1
-            expected = _carried_on(pieces[t - back], pieces.get(t - 2 * back))
-            prior = PosePrior(expected, np.deg2rad(settings.turn_deg), np.deg2rad(2 * settings.turn_deg), diagonal)
-            pieces[t] = fit_pose(model.linkage, expected, surface, [views[t]], scales, prior, settings.steps)
+            pieces[t] = sequence.fitted(_carried_on(pieces[t - back], pieces.get(t - 2 * back)), t)
             progress(_STAGE, len(pieces), frames + 1)
-    motion = JointMotion(*(np.concatenate([getattr(pieces[t], n) for t in range(frames)]) for n in ("local", "root")))
-    # All frames together
-    motion = _fit_all(model, surface, motion, views, scales, paths, settings)
-    bodies = body_motion(model.linkage, motion)
-    distance = np.array([distance_between(p, v) for p, v in zip(surface.posed(bodies), views, strict=True)])
-    progress(_STAGE, frames + 1, frames + 1)
-    return FollowedSequence(bodies, distance, first)
+    return sequence.fitted_together(pieces, paths, first, progress)
+
+
+def fit_motion(
+    model: SubjectModel,
+    start: JointMotion,
+    read: Callable[[int], tuple[np.ndarray, np.ndarray | None]],
+    spacing: float,
+    paths: MotionPaths | None = None,
+    settings: FollowingSettings | None = None,
+    progress: Progress = silent,
+) -> FollowedSequence:
+    """Fit a motion that was found to the surfaces of all frames: they show bodies that no path follows.
+
+    From the frame that fits best on, both ways, each frame is fitted from the pose that was found and from where the
+    frame before leads; what fits better is kept. Then all frames are fitted together.
+
+    Parameters
+    ----------
+    model : SubjectModel
+    start : JointMotion
+        Of T frames, from the model's rest pose.
+    read, spacing, paths, settings, progress
+        See `follow_model`.
+
+    Raises
+    ------
+    GeometryError
+        If a frame holds too few points.
+    """
+    settings = settings or FollowingSettings()
+    frames = start.frames
+    sequence = _Sequence.of(model, read, frames, spacing, settings)
+    first = int(np.argmin([sequence.misfit(start.part(slice(t, t + 1)), t) for t in range(frames)]))
+    pieces = {first: sequence.fitted(start.part(slice(first, first + 1)), first)}
+    for order in (range(first + 1, frames), range(first - 1, -1, -1)):
+        for t in order:
+            back = 1 if order.step > 0 else -1
+            starts = (start.part(slice(t, t + 1)), _carried_on(pieces[t - back], pieces.get(t - 2 * back)))
+            tried = [sequence.fitted(pose, t) for pose in starts]
+            pieces[t] = tried[int(np.argmin([sequence.misfit(pose, t) for pose in tried]))]
+            progress(_STAGE, len(pieces), frames + 1)
+    return sequence.fitted_together(pieces, paths, first, progress)
+
+
+@dataclass(frozen=True)
+class _Sequence:
+    """A model's surface and those of the frames that it is fitted to."""
+
+    model: SubjectModel
+    surface: ModelSurface
+    views: list[FrameSurface]
+    scales: MatchingScales
+    settings: FollowingSettings
+
+    @classmethod
+    def of(
+        cls,
+        model: SubjectModel,
+        read: Callable[[int], tuple[np.ndarray, np.ndarray | None]],
+        frames: int,
+        spacing: float,
+        settings: FollowingSettings,
+    ) -> _Sequence:
+        diagonal = model.diagonal
+        scales = MatchingScales(
+            settings.normal * diagonal,
+            settings.color * diagonal,
+            settings.reach * diagonal,
+            max(spacing, model.spacing / 2),
+            settings.along,
+            settings.independence,
+        )
+        views = [_view(*read(t), t, spacing, scales, settings.points) for t in range(frames)]
+        colored = all(v.sought.colors is not None for v in views)
+        return cls(model, ModelSurface.of_model(model, settings.points, colored), views, scales, settings)
+
+    def fitted(self, expected: JointMotion, frame: int) -> JointMotion:
+        """Pose of a frame that fits its surface, near the one expected."""
+        s = self.settings
+        prior = PosePrior(expected, np.deg2rad(s.turn_deg), np.deg2rad(2 * s.turn_deg), self.model.diagonal)
+        view = [self.views[frame]]
+        return fit_pose(self.model.linkage, expected, self.surface, view, self.scales, prior, s.steps)
+
+    def misfit(self, pose: JointMotion, frame: int) -> float:
+        """By what a pose misses a frame's surface."""
+        (placed,) = self.surface.posed(body_motion(self.model.linkage, pose))
+        return misfit(placed, self.views[frame], self.scales)
+
+    def fitted_together(
+        self, pieces: dict[int, JointMotion], paths: MotionPaths | None, first: int, progress: Progress
+    ) -> FollowedSequence:
+        """Fit the poses of all frames together."""
+        frames = len(self.views)
+        parts = [pieces[t] for t in range(frames)]
+        motion = JointMotion(np.concatenate([p.local for p in parts]), np.concatenate([p.root for p in parts]))
+        motion = _fit_all(self.model, self.surface, motion, self.views, self.scales, paths, self.settings)
+        bodies = body_motion(self.model.linkage, motion)
+        posed = self.surface.posed(bodies)
+        distance = np.array([distance_between(p, v) for p, v in zip(posed, self.views, strict=True)])
+        progress(_STAGE, frames + 1, frames + 1)
+        return FollowedSequence(bodies, distance, first)
 
 
 def _view(
