@@ -95,15 +95,16 @@ def read_text(path: Path, error: type[GeomocapError], hint: str = "", most: int 
 
 def read_toml(path: Path, error: type[GeomocapError], hint: str = "") -> dict[str, Any]:
     """Read a TOML file; raises `error` if it can't be read or is none."""
-    return parse_toml(read_text(path, error, hint), path, error)
+    return parse_toml(read_text(path, error, hint), path, error, hint)
 
 
-def parse_toml(text: str, path: Path | str, error: type[GeomocapError]) -> dict[str, Any]:
+def parse_toml(text: str, path: Path | str, error: type[GeomocapError], hint: str = "") -> dict[str, Any]:
     """Read TOML from a text; raises `error` if it is none."""
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as failed:
-        raise error(f"{path}: not valid TOML ({reason(failed)})") from None
+        after = f"; {hint}" if hint else ""
+        raise error(f"{path}: not valid TOML ({reason(failed)}){after}") from None
 
 
 def read_json(path: Path, error: type[GeomocapError], hint: str = "delete it and run again") -> Any:
