@@ -111,6 +111,25 @@ def test_silhouettes_with_mistakes_are_no_contradiction():
     assert found_in(rig, shown) == ()
 
 
+@pytest.mark.parametrize("cameras", [4, 8])
+@pytest.mark.parametrize("frame", [0, 3])
+def test_a_subject_in_the_background_is_told(cameras, frame):
+    rig = walk_rig(cameras)
+    shown = walk(rig, FRAMES)
+    there = shown[frame][1]  # what is the same in the background isn't seen, and what was there is
+    (wrong,) = found_in(rig, changed(shown, 1, lambda m: m ^ there))
+    assert wrong.cameras == ("cam2",)
+
+
+@pytest.mark.parametrize("cameras", [4, 8])
+def test_a_subject_that_hides_from_a_camera_is_no_contradiction(cameras):
+    rig = walk_rig(cameras)
+    shown = walk(rig, FRAMES)
+    shown = [[m * np.uint8(c != 1 or k > 1) for c, m in enumerate(row)] for k, row in enumerate(shown)]
+    shown[2][1] &= np.uint8(np.arange(96) < 48)
+    assert found_in(rig, shown) == ()
+
+
 def test_all_inverted_silhouettes_are_told():
     rig = walk_rig(4)
     (wrong,) = found_in(rig, [[1 - m for m in row] for row in walk(rig, 3)])
