@@ -78,8 +78,8 @@ class Names:
         """Return the names of `n` bodies: the user's, or the found ones, or `body00` …"""
         self._check(self.bodies, n, "body", "bodies")
         numbered = body_names(n).tolist()
-        for name in self.bodies.values():
-            if name in numbered and numbered.index(name) not in self.bodies:  # whatever that one is called now
+        for b, name in self.bodies.items():
+            if name in numbered and name != numbered[b]:  # whatever that one is called now
                 raise MotionError(f"{self.source}: the name {name} stands for two things; give each its own")
         default = found if found is not None else numbered
         return _unique([self.bodies.get(b, str(default[b])) for b in range(n)], self.source)
