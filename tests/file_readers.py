@@ -193,6 +193,7 @@ READERS: dict[str, Reader] = {
     "c3d": Reader(small.c3d, _describe_and_read),
     "voxels.ply": Reader(small.voxels, read_voxels),
     "points.ply": Reader(small.cloud("a.ply"), read_points),
+    "bodies.ply": Reader(small.bodies, read_points),
     "scan.npz": Reader(small.arrays("s.npz", points=_RNG.normal(size=(3, 30, 3))), _scan),
     **{f"scan.{e}": Reader(small.mesh(f"a.{e}"), _scan) for e in ("obj", "stl", "off", "glb", "gltf")},
     **{f"scan.{e}": Reader(small.cloud(f"a.{e}"), _scan) for e in ("pcd", "pts", "xyz")},

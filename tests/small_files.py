@@ -17,13 +17,13 @@ from geomocap.export.bvh import write_bvh
 from geomocap.export.markers import markers_from_run
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.trc import write_trc
-from geomocap.files.frame_files import write_voxels
+from geomocap.files.frame_files import write_points, write_voxels
 from geomocap.files.results import (
     write_skeleton,
 )
 from geomocap.files.rigs import colmap_model, write_rig
 from geomocap.files.run import Run
-from geomocap.model.frame_geometry import Voxels
+from geomocap.model.frame_geometry import BodyPoints, Voxels
 from geomocap.model.rig import Rig
 from geomocap.subject.subject_model import write_model
 from tests.geomocap.articulated import articulated_skeleton
@@ -152,6 +152,14 @@ def cloud(name: str, **options: object) -> Callable[[Path], Path]:
         return folder / name
 
     return make
+
+
+def bodies(folder: Path) -> Path:
+    """A cloud with bodies, colours and normals."""
+    draw = np.random.default_rng(0)
+    colors, normals = draw.integers(0, 256, (40, 3)).astype(np.uint8), draw.normal(size=(40, 3))
+    write_points(folder / "a.ply", BodyPoints(draw.normal(size=(40, 3)), np.arange(40) % 3, colors, normals))
+    return folder / "a.ply"
 
 
 def voxels(folder: Path) -> Path:

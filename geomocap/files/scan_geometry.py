@@ -125,7 +125,8 @@ def read_mesh(path: Path) -> trimesh.Trimesh | None:
     """
     check_geometry(path)
     try:
-        mesh = trimesh.load(path, process=False, force="mesh")
+        with np.errstate(invalid="ignore"):  # of signalling NaN
+            mesh = trimesh.load(path, process=False, force="mesh")
         if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
             return None
         if np.shape(mesh.vertices)[1:] != (3,) or np.shape(mesh.faces)[1:] != (3,):
