@@ -13,7 +13,7 @@ import pygltflib
 from data_tools.asset import AssetError
 from geomocap.errors import CaptureError
 from geomocap.files.images import decode_image
-from geomocap.reading import read_bytes
+from geomocap.reading import quiet_nan, read_bytes
 
 COMPONENT_TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 MOST_ELEMENTS = 1 << 26  # of an accessor; vertices of the largest meshes are a tenth of that
@@ -54,7 +54,7 @@ class GltfBuffers:
             where = self._elements(s.indices.bufferView, s.indices.byteOffset or 0, s.count, where_kind, 1)
             values[where[:, 0]] = self._elements(s.values.bufferView, s.values.byteOffset or 0, s.count, kind, width)
         if kind.kind == "f":
-            values = values.astype(np.float64)
+            values = quiet_nan(values).astype(np.float64)
         elif accessor.normalized:
             # Section 3.6.2.2: signed integers have one value more below zero, which also means -1
             values = np.maximum(values.astype(np.float64) / np.iinfo(kind.str).max, -1.0)

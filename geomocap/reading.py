@@ -14,6 +14,8 @@ import tomllib
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
+
 from geomocap.errors import GeomocapError, harmless, shortened
 
 __all__ = [
@@ -22,6 +24,7 @@ __all__ = [
     "list_folder",
     "open_plain",
     "parse_toml",
+    "quiet_nan",
     "read_bytes",
     "read_json",
     "read_text",
@@ -95,15 +98,16 @@ def read_text(path: Path, error: type[GeomocapError], hint: str = "", most: int 
 
 def read_toml(path: Path, error: type[GeomocapError], hint: str = "") -> dict[str, Any]:
     """Read a TOML file; raises `error` if it can't be read or is none."""
-    return parse_toml(read_text(path, error, hint), path, error)
+    return parse_toml(read_text(path, error, hint), path, error, hint)
 
 
-def parse_toml(text: str, path: Path | str, error: type[GeomocapError]) -> dict[str, Any]:
+def parse_toml(text: str, path: Path | str, error: type[GeomocapError], hint: str = "") -> dict[str, Any]:
     """Read TOML from a text; raises `error` if it is none."""
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as failed:
-        raise error(f"{path}: not valid TOML ({reason(failed)})") from None
+        after = f"; {hint}" if hint else ""
+        raise error(f"{path}: not valid TOML ({reason(failed)}){after}") from None
 
 
 def read_json(path: Path, error: type[GeomocapError], hint: str = "delete it and run again") -> Any:
@@ -129,6 +133,15 @@ def reason(failed: BaseException) -> str:
         return "a number with thousands of digits"
     lines = [line.strip() for line in str(failed).splitlines() if line.strip()]
     return harmless(shortened(lines[0] if lines else type(failed).__name__, 120))
+
+
+def quiet_nan(values: np.ndarray) -> np.ndarray:
+    """Return numbers of a file without signalling NaN, which make arithmetic warn; they are NaN like others then."""
+    if values.dtype.kind != "f" or not (missing := np.isnan(values)).any():
+        return values
+    values = values.copy()
+    values[missing] = np.nan
+    return values
 
 
 def check_name(name: str, where: str, error: type[GeomocapError], what: str = "camera") -> None:

@@ -8,7 +8,9 @@ from hypothesis import HealthCheck, given, settings
 from geomocap.errors import GeomocapError
 from geomocap.files.camera_file import CameraDoubts
 from geomocap.model.diagnostics import Diagnostics
-from tests.damaged_files import READERS, damaged, damages, survives
+from tests.damaged_files import damaged, damages, survives
+from tests.file_readers import READERS
+from tests.found_damages import FOUND
 
 EXAMPLES, UNHURRIED = 40, list(HealthCheck)
 
@@ -38,6 +40,12 @@ def test_files_cut_off_are_refused_or_read(name, tmp_path):
     file.unlink()
     file.mkdir()
     try:
-        assert reader.read(file) in (None, [], Diagnostics(), CameraDoubts())  # what need not be there
+        assert reader.read(file) in (None, [], {}, set(), Diagnostics(), CameraDoubts())  # what need not be there
     except GeomocapError as error:
         assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize(("name", "done"), FOUND)
+def test_what_once_broke_a_reader_is_refused_or_read(name, done, tmp_path):
+    file = READERS[name].make(tmp_path)
+    survives(READERS[name], file, damaged(file.read_bytes(), done))

@@ -10,7 +10,7 @@ import numpy as np
 from geomocap.carving.carving_settings import ENCLOSING, HullSettings
 from geomocap.carving.hull import hull
 from geomocap.carving.silhouette_views import PinholeViews
-from geomocap.carving.subject_bounds import CELLS, focus, subject_cells
+from geomocap.carving.subject_bounds import CELLS, space_seen, subject_cells
 from geomocap.carving.voxel_grid import Grid
 from geomocap.errors import CalibrationError, GeometryError
 
@@ -198,7 +198,7 @@ def check_inside(surface: np.ndarray, grid: Grid, frame: int, max_cut: float = 0
 def _fraction_view(views: PinholeViews, settings: HullSettings = ALL) -> bool:
     """Whether some point is seen by enough cameras, looking on several scales round where their axes meet."""
     everything = views.everything()
-    center, reach = focus(everything)
+    center, reach = space_seen(everything)
     for scale in (0.1, 0.5, 1.0, 3.0, 10.0):
         grid = Grid.of_box(center - scale * reach, center + scale * reach, resolution=CELLS)
         if hull(everything, grid, settings).bits.any():

@@ -55,7 +55,7 @@ def subject_cells(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarr
     edge : float, metres
     """
     tables = _tables(views, settings)
-    center, reach = focus(views)
+    center, reach = space_seen(views)
     for _ in range(10):
         origin = center - reach
         cells, level = np.zeros((1, 3), np.int64), 0
@@ -128,6 +128,14 @@ def _connected(cells: np.ndarray) -> np.ndarray:
     row, column = np.concatenate(rows), np.concatenate(columns)
     graph = coo_array((np.ones(len(row), np.int8), (row, column)), shape=(len(keys), len(keys)))
     return connected_components(graph, directed=False)[1]
+
+
+def space_seen(views: PinholeViews) -> tuple[np.ndarray, float]:
+    """Return `focus`; raises GeometryError if the cameras stand in one place, so that no depth can come from them."""
+    center, reach = focus(views)
+    if not reach > 0:
+        raise GeometryError(f"cameras {', '.join(views.names)} stand in one place; check the poses in the calibration")
+    return center, reach
 
 
 def focus(views: PinholeViews) -> tuple[np.ndarray, float]:

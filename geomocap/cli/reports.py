@@ -93,7 +93,7 @@ def tell_faults(run: Run) -> None:
 def capture_of(run: Run) -> Capture | None:
     """Open the capture that a run was made from; None if there was none or it has gone."""
     source = run.read_record().get("source", {})
-    if source.get("kind") != "capture":
+    if source.get("kind") != "capture" or "path" not in source:
         return None
     try:
         opened = without_left_out(Capture.open(Path(source["path"])), read_camera_doubts(run))

@@ -96,13 +96,8 @@ def check_cameras_of(
     looks = list(map_items(look, capture.cameras, executor, "cameras", progress, 4))
     warnings = [w for found in looks for w in found.warnings]
     warnings += mixed_up(dict(zip(capture.cameras, looks, strict=True)))
-    odd = [] if rig is None else [n for n, c in zip(rig.names, rig.cameras, strict=True) if c.mean_focal_length() <= 0]
     blank = [name for name, found in zip(capture.cameras, looks, strict=True) if found.blank]
-    seen = {
-        name: found
-        for name, found in zip(capture.cameras, looks, strict=True)
-        if found.masks is not None and name not in odd
-    }
+    seen = {name: found for name, found in zip(capture.cameras, looks, strict=True) if found.masks is not None}
     names = list(seen)
     contradictions: tuple[Contradiction, ...] = ()
     if rig is not None and len(names) > 1:
@@ -117,7 +112,7 @@ def check_cameras_of(
         contradictions = find_contradictions(evidence, capture.n_frames, moments)
     contradicting = [c for found in contradictions for c in found.cameras if len(found.cameras) < max(3, len(names))]
     return CameraCheck(
-        tuple(dict.fromkeys([*odd, *blank, *contradicting])),
+        tuple(dict.fromkeys([*blank, *contradicting])),
         tuple(dict.fromkeys([*doubts, *warnings, *map(str, contradictions)])),
     )
 

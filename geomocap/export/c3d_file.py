@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from geomocap.export.export_errors import MotionError
-from geomocap.reading import read_bytes, reason
+from geomocap.reading import quiet_nan, read_bytes, reason
 
 _BLOCK = 512
 _KEY = 0x50
@@ -179,9 +179,9 @@ def _value(data: bytes, at: int, order: str, dec: bool) -> Value:
 def _floats(raw: bytes, order: str, dec: bool) -> np.ndarray:
     """Read numbers of 4 bytes; DEC's have their halves exchanged and an exponent that is two larger."""
     if not dec:
-        return np.frombuffer(raw, f"{order}f4").astype(np.float64)
+        return quiet_nan(np.frombuffer(raw, f"{order}f4")).astype(np.float64)
     words = np.frombuffer(raw, "<u2").reshape(-1, 2)[:, ::-1]
-    return np.ascontiguousarray(words).view("<f4").ravel().astype(np.float64) / 4
+    return quiet_nan(np.ascontiguousarray(words).view("<f4").ravel()).astype(np.float64) / 4
 
 
 def _number(parameters: Mapping[str, Value], name: str, otherwise: float) -> float:

@@ -77,7 +77,11 @@ class Names:
     def body_names(self, n: int, found: Sequence[str] | np.ndarray | None = None) -> tuple[str, ...]:
         """Return the names of `n` bodies: the user's, or the found ones, or `body00` …"""
         self._check(self.bodies, n, "body", "bodies")
-        default = found if found is not None else body_names(n)
+        numbered = body_names(n).tolist()
+        for b, name in self.bodies.items():
+            if name in numbered and name != numbered[b]:  # whatever that one is called now
+                raise MotionError(f"{self.source}: the name {name} stands for two things; give each its own")
+        default = found if found is not None else numbered
         return _unique([self.bodies.get(b, str(default[b])) for b in range(n)], self.source)
 
     def joint_names(

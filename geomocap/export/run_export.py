@@ -10,7 +10,6 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from geomocap.angles.angle_set import AngleSet
-from geomocap.errors import RunError
 from geomocap.export.angle_files import angle_table, run_angles, write_mot
 from geomocap.export.bvh import write_bvh
 from geomocap.export.c3d import write_c3d
@@ -38,6 +37,7 @@ from geomocap.export.usd import write_usd
 from geomocap.files.atomic import remove_remains, write_text
 from geomocap.files.results import ELLIPSOIDS, KEYPOINTS, read_ellipsoids, read_keypoint_paths, read_skeleton
 from geomocap.files.run import Run
+from geomocap.files.run_records import RECORD
 from geomocap.model.skeleton import Skeleton
 from geomocap.naming.found_names import FoundNames
 from geomocap.progress import Progress, silent
@@ -175,21 +175,17 @@ def export_run(
 
 def run_settings(run: Run) -> ExportSettings:
     """Return the settings that a run's motion files were made with, as its record says; the defaults if it doesn't."""
-    file = run.path / "run.toml"
+    file = run.path / RECORD
     recorded = run.read_record().get("config", {}).get("export", {}) if file.is_file() else {}
     return check_settings(ExportSettings, recorded, str(file))
 
 
 def run_up(run: Run) -> Axis:
     """Return the world axis of a run that points up, as its record says; z if there is no record."""
-    try:
-        up = run.read_record().get("source", {}).get("up", "z")
-    except RunError:
+    if not (run.path / RECORD).is_file():
         return "z"
     axes: dict[str, Axis] = {"x": "x", "y": "y", "z": "z"}
-    if up not in axes:
-        raise MotionError(f"{run.path / 'run.toml'}: source.up is {up!r}; expected x, y or z")
-    return axes[up]
+    return axes[run.read_record().get("source", {}).get("up", "z")]
 
 
 def mean_radius(run: Run) -> float:

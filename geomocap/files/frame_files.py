@@ -14,7 +14,7 @@ from geomocap.files.geometry_claims import check_geometry
 from geomocap.files.open3d_geometry import check_ply, read_by_open3d, write_by_open3d
 from geomocap.files.whole_files import is_whole_ply
 from geomocap.model.frame_geometry import BodyPoints, Voxels
-from geomocap.reading import open_plain, read_bytes
+from geomocap.reading import open_plain, quiet_nan, read_bytes
 
 
 def write_voxels(path: Path, voxels: Voxels) -> None:
@@ -70,15 +70,19 @@ def read_points(path: Path) -> BodyPoints:
     cloud = read_by_open3d(o3d.t.io.read_point_cloud, path)
     if "positions" not in cloud.point or not len(cloud.point.positions):
         raise GeometryError(f"{path}: no readable points; delete it and run again")
-    positions = cloud.point.positions.numpy().astype(np.float64)
+    positions = quiet_nan(cloud.point.positions.numpy()).astype(np.float64)
     body, colors, normals = np.full(len(positions), -1), None, None
     if "body" in cloud.point:
-        body = cloud.point["body"].numpy().ravel().astype(int)
+        body = np.nan_to_num(cloud.point["body"].numpy().ravel(), nan=-1, posinf=-1, neginf=-1).astype(int)
     if "colors" in cloud.point:
         colors = cloud.point.colors.numpy()
-        colors = colors if colors.dtype == np.uint8 else np.clip(np.rint(colors * 255), 0, 255).astype(np.uint8)
+        colors = (
+            colors
+            if colors.dtype == np.uint8
+            else np.clip(np.rint(np.nan_to_num(colors) * 255), 0, 255).astype(np.uint8)
+        )
     if "normals" in cloud.point:
-        normals = cloud.point.normals.numpy().astype(np.float64)
+        normals = quiet_nan(cloud.point.normals.numpy()).astype(np.float64)
     return BodyPoints(positions, body, colors, normals)
 
 

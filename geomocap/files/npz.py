@@ -17,7 +17,7 @@ import numpy as np
 
 from geomocap.errors import RunError
 from geomocap.files.atomic import write_atomic
-from geomocap.reading import open_plain, reason
+from geomocap.reading import open_plain, quiet_nan, reason
 
 UNPACKED_FREELY = 1 << 28  # bytes; arrays that unpack to no more are never looked at for their packing
 MOST_PACKED = 200  # times; what was measured is packed to a half, truth values to a hundredth
@@ -129,4 +129,4 @@ def _array(stream: BinaryIO | IO[bytes], length: int) -> np.ndarray:
             f"an array of shape {shape} takes {count * kind.itemsize:,} bytes, {length - stream.tell():,} are there"
         )
     values = np.frombuffer(stream.read(), kind) if count and kind.itemsize else np.zeros(count, kind)
-    return values.reshape(shape, order="F" if by_column else "C").copy()
+    return quiet_nan(values.reshape(shape, order="F" if by_column else "C").copy())

@@ -26,6 +26,7 @@ _BYTES = {
     **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
     **dict.fromkeys(("double", "float64"), 8),
 }
+_NUMERIC = b"0123456789+-.eE \t\r\n\v\fnaNA"  # all that text of finite numbers and NaN is made of
 _HEADER_LIMIT = 1 << 16  # bytes
 _PLY_HEADER = 512  # bytes, about
 _alone = threading.Lock()  # the verbosity is one for all threads
@@ -81,7 +82,11 @@ def check_ply(path: Path) -> None:
             file.seek(len(head) + len(end))
             kind, elements = _header(head if end else b"")
             if kind == "ascii":
-                lines = sum(1 for line in file.read().splitlines() if line.strip())
+                body = file.read()
+                if strange := body.translate(None, _NUMERIC):
+                    what = f"{chr(strange[0])!r} where finite numbers are expected"
+                    raise GeometryError(f"{path}: PLY has {what}; make it again")
+                lines = sum(1 for line in body.splitlines() if line.strip())
                 missing = sum(e.count for e in elements if e.properties) - lines
             else:
                 file.readline()

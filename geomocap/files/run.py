@@ -12,7 +12,6 @@ import hashlib
 import json
 import threading
 import time
-import tomllib
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -25,6 +24,7 @@ import tomli_w
 from geomocap.errors import RunError
 from geomocap.files.atomic import links, write_text
 from geomocap.files.npz import read_npz, write_npz
+from geomocap.files.run_records import RECORD, TIMINGS, read_run_record, read_timings
 from geomocap.files.stage_records import (
     FOLDER,
     FileMark,
@@ -243,7 +243,7 @@ class Run:
         RunError
             If the folder is no run yet and holds results already, which then are somebody else's.
         """
-        if self.has("run.toml") or stages(self.path):
+        if self.has(RECORD) or stages(self.path):
             return
         patterns = (*(f"{name}/{own}" for name, own in _OWN.items()), *_RESULTS)
         theirs = next((p for pattern in patterns for p in self.path.glob(pattern)), None)
@@ -252,7 +252,7 @@ class Run:
 
     def write_record(self, record: dict[str, Any]) -> None:
         """Write `run.toml`: the configuration, the versions and the source."""
-        write_text(self.path / "run.toml", tomli_w.dumps(record))
+        write_text(self.path / RECORD, tomli_w.dumps(record))
 
     def read_record(self) -> dict[str, Any]:
         """Read `run.toml`.
@@ -262,17 +262,7 @@ class Run:
         RunError
             If the folder is no run.
         """
-        file = self.path / "run.toml"
-        try:
-            record = tomllib.loads(file.read_text(encoding="utf-8"))
-        except OSError:
-            raise RunError(f"{self.path}: no run folder, it has no run.toml") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise RunError(f"{file}: not valid TOML ({error}); delete it and run again") from None
-        for name in ("source", "config", "geomocap"):
-            if not isinstance(record.get(name, {}), dict):
-                raise RunError(f"{file}: {name} is no table, as it is in the record of a run; delete it and run again")
-        return record
+        return read_run_record(self.path)
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[dict[str, int]]:
@@ -291,15 +281,8 @@ class Run:
                 "items": count["items"],
                 "items_per_second": round(rate, 3),
             }
-            write_text(self.path / "timings.json", json.dumps(timings, indent=1))
+            write_text(self.path / TIMINGS, json.dumps(timings, indent=1))
 
     def read_timings(self) -> dict[str, dict[str, float]]:
         """Read `timings.json`; empty if there is none."""
-        try:
-            found = json.loads((self.path / "timings.json").read_text(encoding="utf-8"))
-            return {
-                str(stage): {name: timing[name] + 0 for name in ("seconds", "items", "items_per_second")}
-                for stage, timing in found.items()
-            }
-        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
-            return {}
+        return read_timings(self.path)

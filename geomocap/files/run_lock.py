@@ -16,6 +16,7 @@ from geomocap.errors import RunError
 from geomocap.files.atomic import remove_remains, write_text
 from geomocap.files.run import Run
 from geomocap.files.stage_records import FOLDER
+from geomocap.reading import MOST_TEXT, read_bytes
 
 LOCK, WHO = "run.lock", "run.who"
 
@@ -77,7 +78,7 @@ def working_in(
 def _who(run: Run) -> str:
     """Say who works in a run, as far as is known."""
     try:
-        said = json.loads((run.path / FOLDER / WHO).read_text(encoding="utf-8"))
+        said = json.loads(read_bytes(run.path / FOLDER / WHO, MOST_TEXT))
         doing = f"`geomocap {said['doing']}`, " if said["doing"] else ""
         return f"another process ({doing}process {said['process']} of {said['machine']}, since {said['since']})"
     except (OSError, ValueError, KeyError, TypeError):

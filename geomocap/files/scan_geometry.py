@@ -116,7 +116,7 @@ def read_surface(path: Path) -> ScanSurface:
 
 
 def read_mesh(path: Path) -> trimesh.Trimesh | None:
-    """Read the triangles of a file; None if it has none.
+    """Read the triangles of a file, those given several times once; None if it has none.
 
     Raises
     ------
@@ -125,12 +125,16 @@ def read_mesh(path: Path) -> trimesh.Trimesh | None:
     """
     check_geometry(path)
     try:
-        mesh = trimesh.load(path, process=False, force="mesh")
+        with np.errstate(invalid="ignore"):  # of signalling NaN
+            mesh = trimesh.load(path, process=False, force="mesh")
         if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
             return None
         if np.shape(mesh.vertices)[1:] != (3,) or np.shape(mesh.faces)[1:] != (3,):
             raise GeometryError(f"{path}: its vertices have {np.shape(mesh.vertices)[1:]} coordinates; make it again")
         check_faces(mesh.faces, len(mesh.vertices), path)
+        single = mesh.unique_faces()
+        if not single.all():  # thousands in one place would take rays for ever
+            mesh.update_faces(single)
         return mesh
     except GeometryError:
         raise

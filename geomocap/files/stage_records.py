@@ -16,6 +16,7 @@ from typing import Any
 
 from geomocap.errors import RunError
 from geomocap.files.atomic import write_text
+from geomocap.reading import open_plain, read_bytes
 
 FOLDER = ".stages"
 _CHUNK = 1 << 20  # bytes
@@ -105,7 +106,7 @@ def stages(run: Path) -> list[str]:
 def read_record(run: Path, stage: str) -> StageRecord:
     """Read the record of a stage with what its journal adds; an empty one if there is none that can be read."""
     try:
-        said = json.loads((run / FOLDER / f"{stage}.json").read_text(encoding="utf-8"))
+        said = json.loads(read_bytes(run / FOLDER / f"{stage}.json"))
         files = {str(name): FileMark(*map(int, mark)) for name, mark in said.get("files", {}).items()}
         record = StageRecord(str(said["key"]), bool(said["done"]), tuple(map(str, said["outputs"])), files)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
@@ -163,14 +164,14 @@ def _stays_inside(name: str) -> bool:
 
 def _lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8", errors="replace").splitlines()
+        return read_bytes(path).decode("utf-8", "replace").splitlines()
     except OSError:
         return []
 
 
 def _crc(path: Path) -> int:
     crc = 0
-    with path.open("rb") as file:
+    with open_plain(path) as file:
         while chunk := file.read(_CHUNK):
             crc = zlib.crc32(chunk, crc)
     return crc

@@ -12,8 +12,12 @@ import av
 import numpy as np
 
 from geomocap.errors import CaptureError
+from geomocap.files.image_formats import MOST_PIXELS
+from geomocap.reading import open_plain, reason
 
 VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,asf,flv,ogg"  # none that leads to other files
+_UNREADABLE = (av.FFmpegError, IndexError, OSError, ValueError)
 
 
 @dataclass
@@ -41,11 +45,11 @@ class Video:
     def _times(self) -> tuple[int, ...]:
         """Presentation times of all frames, from the packets alone (nothing is decoded)."""
         try:
-            with av.open(str(self.path)) as container:
+            with self._open() as container:
                 stream = container.streams.video[0]
                 times = sorted(p.pts for p in container.demux(stream) if p.pts is not None and not p.is_discard)
-        except (av.FFmpegError, IndexError, OSError) as error:
-            raise CaptureError(f"{self.path}: no readable video ({error}); record or copy it again") from None
+        except _UNREADABLE as error:
+            raise CaptureError(f"{self.path}: no readable video ({_said(error)}); record or copy it again") from None
         if not times:
             raise CaptureError(f"{self.path}: holds no video frames; record or copy it again")
         return tuple(times)
@@ -65,20 +69,28 @@ class Video:
             if frame not in self._recent:
                 try:
                     self._decode_to(frame)
-                except (av.FFmpegError, StopIteration) as error:
-                    reason = str(error) or "it ends early"
+                except (*_UNREADABLE, StopIteration, MemoryError) as error:
                     raise CaptureError(
-                        f"{self.path}: frame {frame} of {len(self)} can't be decoded ({reason}); copy the file again"
+                        f"{self.path}: frame {frame} of {len(self)} can't be decoded ({_said(error)}); "
+                        "copy the file again"
                     ) from None
             return self._recent[frame]
+
+    def _open(self) -> av.container.InputContainer:
+        """Open the file as a container of pictures; a play list, which would lead to other files, is none."""
+        open_plain(self.path).close()
+        return av.open(str(self.path.absolute()), options={"format_whitelist": CONTAINERS})
 
     def _decode_to(self, frame: int) -> None:
         times = self._times
         if self._container is None or not self._next <= frame <= self._next + 64:
             if self._container is not None:
                 self._container.close()
-            self._container = av.open(str(self.path))
+            self._container = self._open()
             stream = self._container.streams.video[0]
+            if stream.codec_context is None:
+                raise CaptureError(f"{self.path}: pictures are in a code that isn't known; convert the video to H.264")
+            stream.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
             stream.thread_type = "SLICE"  # frame threads would hand out frames late after a seek
             if frame > 0:
                 self._container.seek(times[frame], stream=stream, backward=True)
@@ -97,3 +109,16 @@ class Video:
                 if index > frame:
                     raise CaptureError(f"{self.path}: frame {frame} is missing from the stream; copy the file again")
                 return
+
+
+def _said(error: Exception) -> str:
+    """Say what libav found wrong, without the path that it repeats."""
+    if isinstance(error, StopIteration):
+        return "it ends early"
+    if isinstance(error, IndexError):
+        return "it holds no pictures"
+    if isinstance(error, av.ArgumentError):
+        return "it is no MP4, MOV, MKV, WebM, AVI, MPEG, ASF, FLV or Ogg"
+    if isinstance(error, av.FFmpegError) and error.strerror:
+        return str(error.strerror)
+    return reason(error)

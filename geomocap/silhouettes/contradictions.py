@@ -6,7 +6,8 @@ its images are turned, mirrored, enlarged, inverted, changed for another camera'
 that is what is wrong with it. If no such remedy helps, it is at fault if without it the contradiction falls to less
 than half, and more than half of what it sees, or of what the others see, is denied, or a tenth of both: a silhouette
 with mistakes is denied where it has too much, or denies where it lacks something; one in the wrong place does both.
-A third of what it sees is enough if as much of that stands still: then its background is wrong.
+A third of what it sees is enough if as much of that stands still: then its background is wrong; and anything on both
+sides if it sees nothing in a frame in which the others see the subject: then the subject is in its background.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import cv2
 import numpy as np
 
 from geomocap.carving.silhouette_views import PinholeViews, Undistortion
+from geomocap.carving.subject_bounds import focus
 from geomocap.silhouettes.ray_agreement import unexplained
 
 CLEAR = 0.01  # of the silhouettes: less contradiction than this comes from pixels
@@ -148,6 +150,19 @@ class OwnSilhouettes:
         masks = np.array(self.of_camera(camera))
         return float(masks.min(axis=0).sum() * len(masks) / max(int(masks.sum()), 1))
 
+    def gone(self, camera: int) -> list[int]:
+        """Frames in which a camera sees nothing, though the middle of what most others see lies in its image."""
+        frames = []
+        for frame, views in zip(self.frames, self.views(), strict=True):
+            blind = views.blind()
+            if blind[camera] and blind.sum() < len(blind) / 2:
+                x, y, depth = views.projections[camera] @ [*focus(views.without(camera))[0], 1.0]
+                u, v = (x / depth, y / depth) if depth > 0 else (-1.0, -1.0)
+                height, width = views.valid[camera].shape
+                if 0 <= u < width and 0 <= v < height and views.valid[camera][int(v), int(u)]:
+                    frames.append(frame)
+        return frames
+
     def of_camera(self, camera: int) -> list[np.ndarray]:
         """Silhouettes of a camera, F arrays (H_c, W_c) uint8."""
         return [row[camera] for row in self.masks]
@@ -265,9 +280,12 @@ def _worst(
     for k in at_fault[:1]:
         own, theirs = mean(before[:, k]), mean((before - without[k])[:, others[k]])
         still = theirs < STILL < min(own, evidence.still(k))
-        if max(own, theirs) > 0.5 or min(own, theirs) > DISPLACED or still:
+        gone = [f for f in evidence.gone(k) if min(own, theirs) > CLEAR]
+        if max(own, theirs) > 0.5 or min(own, theirs) > DISPLACED or still or gone:
             what = f"the others deny {own:.0%} of what it sees, and it denies {theirs:.0%} of what they see"
-            if still:
+            if gone:
+                what += f", and in frame {gone[0]} it sees nothing; is the subject in its background?"
+            elif still:
                 what += ", and much of that stands still; is its background right?"
             if evidence.surrounding(k):
                 what = f"it takes {np.mean(evidence.of_camera(k)):.0%} of its image for the subject"

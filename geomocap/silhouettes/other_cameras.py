@@ -28,7 +28,7 @@ from geomocap.carving.block_kernels import summed
 from geomocap.carving.carving_settings import HullSettings
 from geomocap.carving.hull import heard
 from geomocap.carving.silhouette_views import PinholeViews, Undistortion, pad
-from geomocap.carving.subject_bounds import SMALLEST_PART, focus, halve
+from geomocap.carving.subject_bounds import SMALLEST_PART, halve, space_seen
 from geomocap.carving.voxel_grid import Grid
 from geomocap.model.rig import Rig
 from geomocap.silhouettes.likelihood import DEPTHS, SURE
@@ -195,7 +195,7 @@ def common_box(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray,
     heeded, unseen, least = heard(views, settings)
     subject = summed(heeded.masks)
     tables = subject, summed(heeded.valid) if unseen.any() else subject, unseen, least
-    center, reach = focus(views)
+    center, reach = space_seen(views)
     for _ in range(DOUBLINGS):
         origin, edge = center - reach, 2 * reach
         cells = np.zeros((1, 3), np.int64)

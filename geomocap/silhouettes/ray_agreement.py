@@ -26,7 +26,8 @@ def unexplained(views: PinholeViews, heeded: np.ndarray | None = None, blind: np
     """Share of each silhouette that the other cameras deny, (C,) float; NaN for cameras not asked or without one.
 
     A camera denies a point within its image but further than a pixel from its silhouette, and one outside of its image
-    unless that cuts the silhouette off. A camera without a silhouette, or with specks only, denies nothing.
+    unless that cuts the silhouette off. A camera without a silhouette, or with specks only, denies nothing. Cameras in
+    one place see along the same rays and are not asked.
 
     Parameters
     ----------
@@ -48,6 +49,8 @@ def unexplained(views: PinholeViews, heeded: np.ndarray | None = None, blind: np
     step = max(float(pixel.min()), 2 * reach / MOST_STEPS)
     unseen = views.cut_off() | empty
     result = np.full(len(views), np.nan)
+    if step <= 0:
+        return result
     for c in np.flatnonzero(heeded & ~empty):
         v, u = np.nonzero(views.masks[c])
         chosen = np.unique(np.linspace(0, len(u) - 1, min(PIXELS, len(u))).round().astype(int))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +22,7 @@ from geomocap.files.run import Run
 from geomocap.files.run_lock import working_in
 from geomocap.pipeline import Job
 from geomocap.scheduling import threads
-from tests.benchmarks.tiny_run import make_tiny
+from tests.benchmarks.tiny_run import make_tiny, quiet
 
 QUICK = {
     "carving": {"resolution": 32},
@@ -31,7 +33,11 @@ QUICK = {
 
 @dataclass(frozen=True)
 class Held:
-    """What this process holds: resident memory in MB, open files, threads."""
+    """What this process holds: resident memory in MB, open files, threads.
+
+    What the C library keeps of freed memory is given back before: how much that is depends on the order in which memory
+    was asked for, and it belongs to nobody.
+    """
 
     memory: float
     files: int
@@ -40,6 +46,8 @@ class Held:
     @classmethod
     def now(cls) -> Held:
         gc.collect()
+        with suppress(AttributeError):  # of the GNU C library
+            ctypes.CDLL(None).malloc_trim(0)
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         folders = [len(os.listdir(f"/proc/self/{name}")) for name in ("fd", "task")]
         return cls(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, *folders)
@@ -70,18 +78,15 @@ def growth(held: list[Held]) -> float:
 
 def main(number: int = 200) -> None:
     """Print what is held as the runs go on."""
-    told = os.fdopen(os.dup(1), "w")
-    for stream in (1, 2):  # Open3D's surface reconstruction talks
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
     held = []
-    with tempfile.TemporaryDirectory() as folder:
+    with quiet() as told, tempfile.TemporaryDirectory() as folder:
         for k, now in enumerate(soak(number, Path(folder))):
             held.append(now)
             if k % 20 == 0 or k == number - 1:
                 print(
                     f"run {k + 1}: {now.memory:.1f} MB, {now.files} files, {now.threads} threads", file=told, flush=True
                 )
-    print(f"growth in the second half: {1000 * growth(held):.1f} kB a run", file=told)
+        print(f"growth in the second half: {1000 * growth(held):.1f} kB a run", file=told)
 
 
 if __name__ == "__main__":

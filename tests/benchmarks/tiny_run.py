@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import io
+import os
 import sys
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import TextIO
 from unittest.mock import patch
 
 from data_tools.figure import figure
@@ -16,6 +19,7 @@ QUICK = [
     *("--carving.resolution", "32", "--refinement.rounds", "0", "--motion_bodies.depth_rounds", "0"),
     *("--no-pictures", "--workers", "1"),
 ]
+VARIANTS: dict[str, tuple[str, ...]] = {"voxels": (), "cloud": ("--source", "cloud"), "report": ("--pictures",)}
 CHANGING = {"timings.json", "run.toml"}
 
 
@@ -47,3 +51,12 @@ def digests(run: Path) -> dict[str, str]:
         for p in sorted(run.rglob("*"))
         if p.is_file() and p.name not in CHANGING and ".stages" not in p.parts
     }
+
+
+@contextmanager
+def quiet() -> Iterator[TextIO]:
+    """Keep what libraries print from being seen; yield where to print instead."""
+    with os.fdopen(os.dup(1), "w") as told, open(os.devnull, "w") as nowhere:
+        for stream in (1, 2):  # Open3D's surface reconstruction talks
+            os.dup2(nowhere.fileno(), stream)
+        yield told

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,8 @@ from geomocap.files.run_lock import working_in
 from geomocap.inspection import describe
 from tests.benchmarks import killed, soak
 from tests.benchmarks.tiny_run import digests, make_tiny, run_tiny
-from tests.geomocap.test_files_writing import content, no_file_beyond, small_disk
+from tests.disks import make_larger, no_file_beyond, small_disk
+from tests.geomocap.test_files_writing import content
 
 
 @pytest.fixture(scope="session")
@@ -116,16 +116,16 @@ def test_a_disk_that_becomes_full_and_then_has_room(whole, tiny, tmp_path, fract
         status, told = run_tiny(tiny, disk / "run")
         lines = [line for line in told.splitlines() if line.startswith("geomocap: ")]
         assert status == 1 and len(lines) == 1 and "can't be written (No space left on device)" in lines[0]
-        subprocess.run(["mount", "-o", "remount,size=30m", str(disk)], check=True)
+        make_larger(disk, 30_000)
         assert run_tiny(tiny, disk / "run")[0] == 0
         assert digests(disk / "run") == digests(whole)
 
 
 @pytest.mark.slow
 def test_killed_at_random_moments(whole, tiny, tmp_path):
-    chance = random.Random(1)
+    chance, context = random.Random(1), killed.prepared()
     for k in range(3):
-        _, wrong = killed.judge(digests(whole), tiny, tmp_path / str(k), chance.uniform(0, 8))
+        _, wrong = killed.judge(context, digests(whole), tiny, tmp_path / str(k), chance.uniform(0, 4))
         assert not wrong
 
 

@@ -5,7 +5,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from geomocap.carving.carving_settings import HullSettings
 from geomocap.carving.silhouette_views import Undistortion
+from geomocap.carving.subject_bounds import subject_box
+from geomocap.errors import GeometryError
+from geomocap.model.rig import Rig
 from geomocap.silhouettes.contradictions import OwnSilhouettes, find_contradictions
 from geomocap.silhouettes.ray_agreement import denied_rays, unexplained
 from tests.geomocap.camera_scenes import changed, posed, walk, walk_rig, with_focal
@@ -109,6 +113,36 @@ def test_silhouettes_with_mistakes_are_no_contradiction():
     shown = changed(walk(rig, FRAMES), 1, lambda m: m * without_feet)
     shown = changed(shown, 3, lambda m: m | blob)
     assert found_in(rig, shown) == ()
+
+
+@pytest.mark.parametrize("cameras", [4, 8])
+@pytest.mark.parametrize("frame", [0, 3])
+def test_a_subject_in_the_background_is_told(cameras, frame):
+    rig = walk_rig(cameras)
+    shown = walk(rig, FRAMES)
+    there = shown[frame][1]  # what is the same in the background isn't seen, and what was there is
+    (wrong,) = found_in(rig, changed(shown, 1, lambda m: m ^ there))
+    assert wrong.cameras == ("cam2",)
+
+
+@pytest.mark.parametrize("cameras", [4, 8])
+def test_a_subject_that_hides_from_a_camera_is_no_contradiction(cameras):
+    rig = walk_rig(cameras)
+    shown = walk(rig, FRAMES)
+    shown = [[m * np.uint8(c != 1 or k > 1) for c, m in enumerate(row)] for k, row in enumerate(shown)]
+    shown[2][1] &= np.uint8(np.arange(96) < 48)
+    assert found_in(rig, shown) == ()
+
+
+def test_cameras_in_one_place_are_refused():
+    rig = walk_rig(4)
+    poses = np.array(rig.cam_from_world)
+    poses[:, :, 3] = 0
+    rig = Rig(rig.names, rig.cameras, poses)
+    shown = walk(walk_rig(4), 2)
+    found_in(rig, shown)  # can't be judged
+    with pytest.raises(GeometryError, match="cameras cam1, cam2, cam3, cam4 stand in one place"):
+        subject_box(Undistortion.of(rig).views(shown[0]), HullSettings())
 
 
 def test_all_inverted_silhouettes_are_told():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 from fractions import Fraction
 
@@ -88,6 +89,22 @@ def test_videos_are_read_in_any_order(tmp_path):
     for k in (0, 1, 2, 17, 16, 3, 29, 28, 0, 13):
         error = np.abs(video.read(k).astype(int) - picture(0, k)).mean()
         assert error < 3, f"frame {k} is not the one that was written"
+
+
+@pytest.mark.parametrize(
+    "text", ["ffconcat version 1.0\nfile good.mp4\n", "#EXTM3U\n#EXTINF:1,\ngood.mp4\n", "<svg xmlns='a' width='9'/>"]
+)
+def test_a_list_of_other_files_is_no_video(tmp_path, text):
+    write_video(tmp_path / "good.mp4")
+    (tmp_path / "a.mp4").write_text(text)
+    with pytest.raises(CaptureError, match=r"a\.mp4: no readable video \((it is no MP4|Invalid data)"):
+        len(Video(tmp_path / "a.mp4"))
+
+
+def test_a_pipe_in_place_of_a_video_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "a.mp4")
+    with pytest.raises(CaptureError, match="it is a pipe or a device"):
+        len(Video(tmp_path / "a.mp4"))
 
 
 def test_truncated_video(tmp_path):

@@ -12,7 +12,7 @@ from geomocap.errors import CalibrationError
 from geomocap.files.colmap_model import read_colmap_model
 from geomocap.files.rigs import colmap_model, read_rig
 from geomocap.model.rig import Rig
-from tests.damaged_files import rig
+from tests.small_files import rig
 
 
 @pytest.fixture(scope="module")

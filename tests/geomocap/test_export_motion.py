@@ -108,6 +108,13 @@ def test_names_of_the_user(tmp_path):
     assert joints[2] == "hip_right"
 
 
+def test_a_body_s_number_is_no_name_of_another():
+    found = ["hips", "thigh", "shank"]
+    assert Names({0: "body00", 1: "body07"}).body_names(3, found) == ("body00", "body07", "shank")
+    with pytest.raises(MotionError, match="the name body01 stands for two things"):
+        Names({0: "body01"}).over({1: "knee"}, {}).body_names(3, found)
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [

@@ -114,7 +114,7 @@ def test_up_is_the_captures(run):
     positions = skeleton_arrays()["joint_positions"]
     np.testing.assert_allclose(read_trc(run.path / "motion.trc").positions, positions, atol=1e-6)
     run.write_record({"source": {"up": "sideways"}})
-    with pytest.raises(MotionError, match=r"source\.up is 'sideways'"):
+    with pytest.raises(RunError, match=r"source\.up is 'sideways'; expected x, y or z"):
         export_run(run, ["trc"])
 
 

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import os
-import resource
-import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -33,6 +30,7 @@ from geomocap.files.images import write_image, write_mask
 from geomocap.files.npz import write_npz
 from geomocap.files.rigs import read_rig
 from geomocap.model.frame_geometry import BodyPoints, Voxels
+from tests.disks import no_file_beyond, small_disk
 from tests.geomocap.articulated import skeleton_arrays, skeleton_of
 from tests.geomocap.ball import ring
 from viz.drawing import write_png
@@ -85,30 +83,6 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "binary_model": partial(write_colmap, ring(12, 40), binary=True),
 }
 NEEDS = {"c3d": "ezc3d", "usdc": "pxr", "usda": "pxr", "parquet": "pyarrow"}
-
-
-@contextmanager
-def no_file_beyond(size: int) -> Iterator[None]:
-    """Let no file of this process grow beyond a size, bytes: the same to a writer as a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
-@contextmanager
-def small_disk(place: Path, kilobytes: int) -> Iterator[Path]:
-    """Mount a disk of some kB."""
-    place.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(place)]
-    if not shutil.which("mount") or subprocess.run(mount, capture_output=True).returncode:
-        pytest.skip("no right to mount a small disk")
-    try:
-        yield place
-    finally:
-        subprocess.run(["umount", "-l", str(place)], check=True)
 
 
 def content(folder: Path) -> dict[str, bytes]:

@@ -51,6 +51,14 @@ def test_files_of_a_run_are_whole(tmp_path):
             check_ply(file)
 
 
+@pytest.mark.parametrize("word", [b"inf", b"1,5", b"x"])
+def test_words_in_place_of_numbers_are_told(tmp_path, word, capfd):
+    (tmp_path / "a.ply").write_bytes(HEADER + b" 2\nproperty double x\nend_header\n1.5e-3\n" + word + b"\n")
+    with pytest.raises(GeometryError, match="where finite numbers are expected"):
+        read_by_open3d(o3d.io.read_point_cloud, tmp_path / "a.ply")
+    assert capfd.readouterr() == ("", "")
+
+
 @pytest.mark.parametrize(
     "content",
     [b"", b"garbage", HEADER + b" 1\n", HEADER + b" x\nend_header\n"],

@@ -97,6 +97,32 @@ def test_npz_is_never_executed(tmp_path):
         run.read_npz("none.npz")
 
 
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("= =", "not valid TOML"),
+        ("source = 3", "source is no table"),
+        ("[source]\nfps = true", "source.fps is True; expected a number above 0"),
+        ("[source]\nup = ['z']", r"source.up is \['z'\]; expected x, y or z"),
+        ('[source]\npath = "a\\u0000b"', "source.path is .*expected a path"),
+    ],
+)
+def test_a_record_that_no_run_wrote_is_refused(tmp_path, text, says):
+    (tmp_path / "run.toml").write_text(text)
+    with pytest.raises(RunError, match=rf"run\.toml: {says}.*; delete it and run again"):
+        Run(tmp_path).read_record()
+
+
+def test_pipes_in_place_of_records_are_not_waited_for(tmp_path):
+    (tmp_path / ".stages").mkdir()
+    for name in ("run.toml", "timings.json", ".stages/a.json", ".stages/a.journal"):
+        os.mkfifo(tmp_path / name)
+    run = Run(tmp_path)
+    with pytest.raises(RunError, match="it is a pipe or a device"):
+        run.read_record()
+    assert run.read_timings() == {} and run.faults() == {} and run.unfinished() == ["a"]
+
+
 def test_timings_add_up(tmp_path):
     run = Run(tmp_path)
     with run.timed("a") as count:

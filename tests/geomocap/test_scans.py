@@ -15,12 +15,21 @@ from geomocap.errors import GeometryError
 from geomocap.export.run_export import run_up
 from geomocap.files.frame_files import write_voxels
 from geomocap.files.run import Run
+from geomocap.files.scan_geometry import read_mesh
 from geomocap.files.scan_settings import ScanSettings
 from geomocap.files.scans import open_scans
 from geomocap.model.frame_geometry import Voxels
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.sources import geometry_of
 from geomocap.scheduling import threads
+
+
+def test_triangles_given_several_times_are_taken_once(tmp_path):
+    file = tmp_path / "a.obj"
+    lines = ["v 0 0 0", "v 1 0 0", "v 0 1 0", "v 0 0 1", "f 1 2 3", "f 1 2 4", "f 3 1 2", "f 1 3 2"]
+    file.write_text("\n".join(lines))
+    mesh = read_mesh(file)
+    assert mesh is not None and mesh.faces.tolist() == [[0, 1, 2], [0, 1, 3]]
 
 
 @pytest.mark.parametrize("ending", ["ply", "obj", "stl", "glb"])

@@ -1,0 +1,10 @@
+"""Damages that once broke a reader, found by fuzzing: read again by every test run."""
+
+from __future__ import annotations
+
+FOUND: list[tuple[str, list[tuple[str, float, object]]]] = [
+    # NaN that signal: arithmetic with them warns
+    ("c3d", [("byte", 0.5, 0), ("over", 0.95703125, b"\xff")]),
+    # a film in a code that libav has no decoder of
+    ("video.webm", [("byte", 0.5, 0), ("double", 0.0, 107), ("byte", 0.25, 0)]),
+]
