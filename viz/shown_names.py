@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import tomli_w
@@ -22,6 +23,11 @@ def names_of(results: Results) -> Names:
     if file.is_file():
         found = Names.read(file)
     return own.over(found.bodies, found.joints)
+
+
+def named(results: Results) -> Results:
+    """Return a run whose bodies and joints are called as in its motion files."""
+    return replace(results, names=names_of(results))
 
 
 def users_names(results: Results) -> Names:
