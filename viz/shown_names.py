@@ -7,10 +7,11 @@ from pathlib import Path
 
 import tomli_w
 
-from geomocap.errors import RunError
+from geomocap.errors import GeomocapError, RunError
 from geomocap.export.export_errors import MotionError
 from geomocap.export.names import Names
-from geomocap.export.run_names import NAMES_FOUND
+from geomocap.export.run_export import run_settings, run_up
+from geomocap.export.run_names import NAMES_FOUND, run_names
 from geomocap.files.atomic import write_text
 from geomocap.model.skeleton import Skeleton
 from viz.run_contents import Results
@@ -46,6 +47,14 @@ def joint_names(results: Results, skeleton: Skeleton) -> tuple[str, ...]:
     names = names_of(results)
     bodies = names.body_names(skeleton.body_count, skeleton.body_names)
     return names.joint_names(skeleton.joint_bodies, bodies, skeleton.joint_names)
+
+
+def trunk_of(results: Results, skeleton: Skeleton) -> int | None:
+    """Return the body that the motion files' tree grows from; None: that of the skeleton."""
+    try:
+        return run_names(results.run, skeleton, run_up(results.run), run_settings(results.run))[1].trunk
+    except GeomocapError:
+        return None  # told where motion files are written
 
 
 def rename(results: Results, kind: str, number: int, name: str) -> Path:

@@ -31,7 +31,7 @@ from viz.camera_pictures import frusta
 from viz.floor import grid_spacing
 from viz.run_contents import Results
 from viz.shown_angles import angles_of, angles_of_node
-from viz.shown_names import joint_names, names_of
+from viz.shown_names import joint_names, names_of, trunk_of
 from viz.viewpoints import ViewStage
 
 SAMPLES = 40_000
@@ -98,7 +98,8 @@ def script_json(data: Any) -> str:
 def motion_of(results: Results, skeleton: Skeleton) -> MotionTree:
     """Return the motion as the run's files have it: a node for each body, in the order of the GLB file."""
     up: Axis = {"x": "x", "y": "y"}.get(results.up, "z")  # type: ignore[assignment]
-    return motion_from_skeleton(skeleton, up=up, names=names_of(results), radius=mean_radius(results.run))
+    radius, root = mean_radius(results.run), trunk_of(results, skeleton)
+    return motion_from_skeleton(skeleton, up=up, names=names_of(results), radius=radius, root=root)
 
 
 def glb_of(results: Results, motion: MotionTree) -> bytes:

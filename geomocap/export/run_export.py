@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from geomocap.angles.anatomical_frames import anatomical_frames
 from geomocap.angles.angle_set import AngleSet
 from geomocap.errors import RunError
 from geomocap.export.angle_files import angle_table, run_angles, write_mot
@@ -130,17 +131,17 @@ def export_run(
     skeleton = read_skeleton(run)
     up = run_up(run)
     names, found = (names, FoundNames()) if names is not None else run_names(run, skeleton, up, settings)
-    motion = motion_from_skeleton(skeleton, up=up, names=names, joints=settings.joints, radius=mean_radius(run))
+    radius, root = mean_radius(run), found.trunk
+    motion = motion_from_skeleton(skeleton, up=up, names=names, joints=settings.joints, radius=radius, root=root)
     markers = run_markers(run, skeleton, names, up, ellipsoids=settings.ellipsoids)
     mesh = surface_of_run(run, motion, settings)
-    shown, skinned = at_rest(motion, mesh, found, settings.rest_pose)
+    shown, skinned = at_rest(motion, mesh, found, settings.rest_pose, anatomical_frames(skeleton, found))
 
     def links(convention: Convention) -> LinkedBodies:
-        fixed = motion_from_skeleton(skeleton, up=up, names=names, joints="fixed", radius=mean_radius(run))
+        fixed = motion_from_skeleton(skeleton, up=up, names=names, joints="fixed", radius=radius, root=root)
         bodies = (names or Names()).body_names(skeleton.body_count, skeleton.body_names)
         labels = (names or Names()).joint_names(skeleton.joint_bodies, bodies, skeleton.joint_names)
-        density, radius = settings.density, mean_radius(run)
-        return linked_bodies(fixed, mesh, labels, convention, density=density, radius=radius)
+        return linked_bodies(fixed, mesh, labels, convention, density=settings.density, radius=radius)
 
     angles = run_angles(run, skeleton, names, found, settings)
     writers = _writers(motion, markers, shown, skinned, settings) | {

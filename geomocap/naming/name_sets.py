@@ -52,8 +52,7 @@ def renamed(found: FoundNames, name_set: NameSetName) -> FoundNames:
     if words.template != found.template.name:
         return found
     first = {body: min(parts) for body, parts in found.parts.items()}
-    own = {body: name for body, name in found.bodies.items() if not name.rsplit("_", 1)[-1].isdigit()}
-    bodies = found.bodies | _words(((b, first[b]) for b in own), words.bodies, found)
+    bodies = found.bodies | _words(((b, first[b]) for b in found.whole), words.bodies, found)
     joints = found.joints | _words(found.joint_parts.items(), words.joints, found)
     return replace(found, bodies=bodies, joints=joints)
 
