@@ -237,8 +237,8 @@ def test_elbows_bend_forward_in_a_rest_pose():
     elbow = {labels[b]: n for n, b in enumerate(rested.bodies)}["forearm_left"]
     t = int(np.argmax(joint_angles(skeleton, found, tuple(skeleton.joint_names)).column("elbow_left_flexion")))
     bent = np.einsum("tji,tjk->tik", R[:, rested.parents[elbow]], R[:, elbow])[t]
-    hand = bent @ np.array([-np.sin(0.7), np.cos(0.7), 0])  # the forearm points to the left in the pose
-    forward, up = hand @ [np.cos(0.7), np.sin(0.7), 0], abs(hand[2])
+    hand = bent @ np.array([1.0, 0, 0])  # the forearm points to the left in the pose, which looks along -y
+    forward, up = -hand[1], abs(hand[2])
     assert forward > 0.2 and up < forward / 2
 
 
@@ -256,7 +256,7 @@ def test_a_rest_pose_changes_the_skeleton_but_not_the_motion(pose):
     R, p = rested.bind_pose(None)
     assert np.abs(R - np.eye(3)).max() == 0
     place = {labels[b]: p[n] for n, b in enumerate(rested.bodies)}
-    left = np.array([-np.sin(0.7), np.cos(0.7), 0])
+    left = np.array([1.0, 0, 0])  # the pose looks along -y, +z of the files
     along = place["hand_left"] - place["upper_arm_left"]
     wanted = left if pose == "T" else (left - [0, 0, 1]) / np.sqrt(2)
     assert along @ wanted > 0.98 * np.linalg.norm(along)
