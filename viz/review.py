@@ -45,8 +45,8 @@ from viz.viewpoints import ViewStage
 
 _HOW = (
     "Drag to turn, click and scroll or pinch to come nearer, right-drag to shift; space plays, the arrow keys go on by "
-    "single frames. Point at a body or joint to read its name, how far it has turned since the first frame, and its "
-    "confidence; click it to keep that in view."
+    "single frames. Point at a body or joint to read its name, its angles with their band, and its confidence; click "
+    "it to keep that in view."
 )
 
 _FOLLOWED = {

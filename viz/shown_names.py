@@ -27,8 +27,13 @@ def names_of(results: Results) -> Names:
 
 
 def named(results: Results) -> Results:
-    """Return a run whose bodies and joints are called as in its motion files."""
-    return replace(results, names=names_of(results))
+    """Return a run whose bodies and joints are called as in its motion files; by number if the names can't be used."""
+    try:
+        renamed = replace(results, names=names_of(results))
+        _ = renamed.skeleton
+    except MotionError:
+        return results
+    return renamed
 
 
 def users_names(results: Results) -> Names:

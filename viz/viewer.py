@@ -62,6 +62,7 @@ class Viewer:
         purpose = "Pages that show a run"
         self.server = serve_page(f"geomocap: {title}", host, port, extra="view", purpose=purpose)
         self.server.scene.world_axes.visible = False
+        self.server.scene.configure_fog(0.0, 1.0, enabled=False)  # large subjects stand far from the eye
         self.chosen: Chosen | None = None
         self.panel = ViewPanel(self.server.gui, self.contents)
         self._shown: list[dict[str, Any]] = []
@@ -111,7 +112,10 @@ class Viewer:
         view = stage.view(30.0, 12.0, (800, 800), _FIELD_DEG)
         R, t = view.cam_from_world[:, :3], view.cam_from_world[:, 3]
         middle = R.T @ (np.array([0, 0, t[2]]) - t) + sum(self._offsets) / len(self._offsets)
-        away = R.T @ np.array([0, 0, t[2]]) * (1.0 if len(self.contents) == 1 else 0.75 * wide / stage.diagonal)
+        away = R.T @ np.array([0, 0, t[2]])
+        if len(self.contents) > 1:  # both beside the panel
+            away *= wide / stage.diagonal
+            middle = middle + 0.2 * wide * R[0]
         first = self.server.initial_camera
         first.look_at, first.position = middle, middle - away
         first.up, first.fov = stage.up, np.radians(1.15 * _FIELD_DEG)
