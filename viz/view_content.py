@@ -44,7 +44,7 @@ GREY = (150, 156, 165)
 
 
 @dataclass(frozen=True)
-class Followed:
+class FollowedPoints:
     """Points that bodies were found from: places (N, T, 3) metres, and the body of each (N,), -1: none."""
 
     places: np.ndarray
@@ -71,7 +71,7 @@ class Content:
         Of the motion's nodes: what the joint at the origin of each is called.
     markers : Markers, optional
     ellipsoids : Ellipsoids, optional
-    followed : Followed, optional
+    followed : FollowedPoints, optional
     rig : Rig, optional
     picture : callable, optional
         A camera's picture of a frame, made smaller to a width at most: (H, W, 3) uint8.
@@ -89,7 +89,7 @@ class Content:
     joint_names: tuple[str, ...] = ()
     markers: Markers | None = None
     ellipsoids: Ellipsoids | None = None
-    followed: Followed | None = None
+    followed: FollowedPoints | None = None
     rig: Rig | None = None
     picture: Callable[[str, int, int], np.ndarray] | None = None
     results: Results | None = None
@@ -267,13 +267,13 @@ def of_run(results: Results) -> Content:
     )  # fmt: skip
 
 
-def _followed(results: Results, count: int) -> Followed | None:
+def _followed(results: Results, count: int) -> FollowedPoints | None:
     """Return the points that were followed through all frames; None if there are none."""
     places, bodies = results.diagnostics.sample_positions, results.diagnostics.sample_body
     if places is None or places.ndim != 3 or places.shape[1] != count or not len(places):
         return None
     known = bodies is not None and len(bodies) == len(places)
-    return Followed(places, bodies if bodies is not None and known else np.full(len(places), -1))
+    return FollowedPoints(places, bodies if bodies is not None and known else np.full(len(places), -1))
 
 
 def of_capture(capture: Capture) -> Content:
