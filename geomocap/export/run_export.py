@@ -27,6 +27,7 @@ from geomocap.export.motion_tree import MotionTree
 from geomocap.export.movement_dataset import write_movement
 from geomocap.export.names import Names
 from geomocap.export.osim import OSIM, write_osim
+from geomocap.export.osim_markers import write_osim_markers
 from geomocap.export.rest_pose import at_rest
 from geomocap.export.run_names import NAMES_FOUND, names_text, run_names
 from geomocap.export.skeleton_motion import UNKNOWN_RADIUS, motion_from_skeleton
@@ -147,7 +148,7 @@ def export_run(
     writers = _writers(motion, markers, shown, skinned, settings) | {
         "angles": lambda path: write_csv(path, angle_table(angles)),
         "mot": lambda path: write_mot(path, angles),
-        "osim": lambda path: write_osim(path, links(OSIM)),
+        "osim": lambda path: _write_osim(path, links(OSIM), found, markers.names[: skeleton.joint_count]),
         "urdf": lambda path: write_urdf(path, links(URDF)),
         "fbx": lambda path: _write_fbx(path, shown, skinned),
         "movement": lambda path: write_movement(path, markers),
@@ -212,6 +213,11 @@ def surface_of_run(run: Run, motion: MotionTree, settings: ExportSettings) -> Sk
     if (run.path / MODEL_FILE).is_file() and settings.skin_frame == 0:
         return skin_from_model(read_model(run.path / MODEL_FILE), motion, settings)
     return skin_from_run(run, motion, settings) if settings.surface == "skin" else None
+
+
+def _write_osim(path: Path, bodies: LinkedBodies, found: FoundNames, labels: tuple[str, ...]) -> None:
+    write_osim(path, bodies)
+    write_osim_markers(path.with_name(f"{path.stem}_markers.xml"), found, labels)
 
 
 def _write_fbx(path: Path, motion: MotionTree, mesh: SkinnedMesh | None) -> None:

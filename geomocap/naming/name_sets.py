@@ -21,18 +21,21 @@ class NameSet:
     ----------
     template : str
     bodies, joints : dict of part with side (thigh_left) to name
+    origins : dict of the same to name
+        The program's body in whose origin the joint lies by which a part begins, where the program has such models.
     """
 
     template: str
     bodies: dict[str, str]
     joints: dict[str, str]
+    origins: dict[str, str]
 
 
 def read_name_set(name: str) -> NameSet:
     """Read a set that comes with the package."""
     text = (resources.files("geomocap.naming") / "name_sets" / f"{name}.toml").read_text(encoding="utf-8")
     table = tomllib.loads(text)
-    return NameSet(table["template"], table.get("bodies", {}), table.get("joints", {}))
+    return NameSet(table["template"], table.get("bodies", {}), table.get("joints", {}), table.get("origins", {}))
 
 
 def renamed(found: FoundNames, name_set: NameSetName) -> FoundNames:
