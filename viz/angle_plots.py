@@ -7,7 +7,11 @@ from matplotlib.figure import Figure
 
 from geomocap.angles.angle_set import AngleSet
 from viz.body_colors import body_color, hex_color
+from viz.desk import Desk
 from viz.figures import WIDTH, figure_of, plot
+from viz.report import Block, text
+from viz.run_contents import Results
+from viz.shown_angles import angles_of
 
 COLUMNS = 3
 MIDDLE = {"left": 0, "right": 1, "a": 0, "b": 1}
@@ -46,3 +50,17 @@ def angle_sheet(angles: AngleSet) -> Figure:
     for ax in axes[::COLUMNS]:
         ax.set_ylabel("degrees")
     return figure
+
+
+def angle_blocks(results: Results, desk: Desk) -> list[Block]:
+    """Return what a report says of names and joint angles."""
+    found = angles_of(results)
+    if found is None or not found[0].names:
+        desk.step()
+        return [] if found is None else [text(found[1])]
+    words = (
+        "As in angles.csv: flexion, adduction and rotation of named joints, zero where limbs are straight; the turn "
+        "about its own axis of any other joint, zero in the first frame. Bands: twice the standard deviation by the "
+        "scatter of the surface; what the surface slides over the bones isn't in them."
+    )
+    return [text(found[1]), *desk.plot("angles", angle_sheet(found[0]), "Joint angles", words)]

@@ -46,6 +46,7 @@ def frusta(results: Results, up: Axis) -> dict[str, Any]:
         half = np.abs(corners).max(axis=0)
         return {
             "name": rig.names[c],
+            "doubtful": rig.names[c] in results.camera_doubts.contradicting,
             "center": _rounded(GLB.points(rig.centers[c], up)),
             "corners": _rounded(GLB.points(directions, up)),
             "forward": _rounded(GLB.points(R[2], up)),

@@ -15,6 +15,7 @@ from geomocap.files.run import Run
 from geomocap.progress import Progress, silent
 from viz import figures, keypoint_plots, separation, sheets
 from viz import track_pictures as tracks
+from viz.angle_plots import angle_blocks
 from viz.desk import Desk
 from viz.films import motion_video
 from viz.keypoint_marks import marks_of_run
@@ -25,6 +26,7 @@ from viz.run_contents import Results
 from viz.scene import stage as find_stage
 from viz.sections import (
     bodies_table,
+    camera_remarks,
     cameras_table,
     changed_files,
     figures_of_quality,
@@ -37,13 +39,14 @@ from viz.sections import (
     title,
     verdict,
 )
+from viz.shown_names import named
 from viz.turntable import Turntable, turntable
 from viz.viewpoints import ViewStage
 
 _HOW = (
     "Drag to turn, click and scroll or pinch to come nearer, right-drag to shift; space plays, the arrow keys go on by "
-    "single frames. Point at a body or joint to read its name, how far it has turned since the first frame, and its "
-    "confidence; click it to keep that in view."
+    "single frames. Point at a body or joint to read its name, its angles with their band, and its confidence; click "
+    "it to keep that in view."
 )
 
 _FOLLOWED = {
@@ -93,7 +96,7 @@ def review(
     GeometryError
         If a geometry file is damaged.
     """
-    results = Results(run, capture)
+    results = named(Results(run, capture))
     if not results.frames:
         raise RunError(f"{run.path}: holds no silhouettes and no geometry; run a stage first")
     chosen = list(frames) if frames is not None else sheets.chosen_frames(results.frames, 4)
@@ -107,7 +110,7 @@ def review(
         stage = find_stage(results)
     except GeometryError:
         stage = None
-    desk = Desk(run.path / "review", progress, 28)
+    desk = Desk(run.path / "review", progress, 29)
     progress("review", 0, desk.total)
     quality = assess(results, chosen)
     desk.step()
@@ -173,7 +176,7 @@ def _inputs(results: Results, stage: ViewStage | None, frames: list[int], desk: 
     if results.capture is None:
         desk.step()
         return [missing("No capture is at hand (the geometry came from elsewhere), so there are no cameras or images.")]
-    blocks: list[Block] = [cameras_table(results)]
+    blocks: list[Block] = [*camera_remarks(results), cameras_table(results)]
     if stage is not None:
         words = "Where the cameras stand and what they look at. Check that up is up, and that the distances are right."
         blocks += desk.sheet("cameras", sheets.cameras_picture(results, stage, frames[0]), "The cameras", words)
@@ -352,11 +355,13 @@ def _skeleton(
     if kinds := separation.joints_table(results):
         blocks.append(kinds)
     if len(results.skeleton.joint_positions) > 1:
+        blocks += angle_blocks(results, desk)
         words = (
             "How far each joint has turned since the first frame, in its body's colour; thin lines: the rotation "
             "vector's parts about the parent's axes. Smooth curves are good."
         )
-        blocks += desk.plot("joint_angles", figures.joint_angles(results.skeleton, results.fps), "Joint angles", words)
+        turned = figures.joint_angles(results.skeleton, results.fps)
+        blocks += desk.plot("joint_angles", turned, "Turns since the first frame", words)
         if quality.bones:
             words = "Bones don't grow: what differs from zero is error of the joints."
             lengths = figures.bone_lengths(quality.bones, results.fps)

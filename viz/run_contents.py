@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from geomocap.export.names import Names
+from geomocap.files.camera_file import CameraDoubts, read_camera_doubts
 from geomocap.files.capture import Capture
 from geomocap.files.results import (
     ELLIPSOIDS,
@@ -38,10 +40,14 @@ KINDS = ("bodies", "voxels", "cloud")
 
 @dataclass(frozen=True)
 class Results:
-    """The files of a run, and the capture that it came from if that is at hand."""
+    """The files of a run, and the capture that it came from if that is at hand.
+
+    Its bodies and joints are called as `names` says; by default as the files say, by number.
+    """
 
     run: Run
     capture: Capture | None = None
+    names: Names | None = None
 
     @cached_property
     def record(self) -> dict[str, Any]:
@@ -140,7 +146,11 @@ class Results:
     def skeleton(self) -> Skeleton | None:
         """The skeleton, if it is there and holds a joint."""
         found = read_skeleton(self.run) if self.run.has(SKELETON) else None
-        return None if found is None or not found.joint_count else found
+        if found is None or not found.joint_count or self.names is None:
+            return None if found is None or not found.joint_count else found
+        bodies = self.names.body_names(found.body_count, found.body_names)
+        joints = self.names.joint_names(found.joint_bodies, bodies, found.joint_names)
+        return replace(found, body_names=np.array(bodies), joint_names=np.array(joints))
 
     @cached_property
     def tracks(self) -> Tracks | None:
@@ -158,9 +168,14 @@ class Results:
         return read_diagnostics(self.run)
 
     @cached_property
+    def camera_doubts(self) -> CameraDoubts:
+        """What was found to be doubtful about the cameras."""
+        return read_camera_doubts(self.run)
+
+    @cached_property
     def remarks(self) -> list[str]:
-        """Warnings in words that the stages left."""
-        return read_warnings(self.run)
+        """Warnings in words that the stages left, those about the cameras first."""
+        return [*self.camera_doubts.warnings, *read_warnings(self.run)]
 
     # --- silhouettes ---
 

@@ -8,7 +8,7 @@ import numpy as np
 import tomli_w
 
 from geomocap.files.check_file import read_self_check
-from geomocap.files.results import read_diagnostics, read_warnings
+from geomocap.files.results import read_diagnostics
 from viz.body_colors import body_color, hex_color
 from viz.quality_figures import Quality
 from viz.report import Block, Section, missing, table, text
@@ -68,7 +68,7 @@ def key_figures(results: Results) -> tuple[tuple[str, str], ...]:
 
 
 def cameras_table(results: Results) -> Block:
-    """Return the table of cameras: sizes, and interior and exterior orientation if the capture is calibrated."""
+    """Return the table of cameras: sizes, orientations if the capture is calibrated, which contradict the others."""
     capture = results.capture
     assert capture is not None
     rows: list[tuple[str, ...]] = []
@@ -77,14 +77,24 @@ def cameras_table(results: Results) -> Block:
             height, width = capture.frame(name, 0).shape[:2]
             rows.append((name, f"{width} × {height}", "not calibrated"))
         return table(("camera", "size (px)", ""), rows)
-    rig = capture.rig
+    rig, doubtful = capture.rig, set(results.camera_doubts.contradicting)
     for name, camera, center, (w, h) in zip(rig.names, rig.cameras, rig.centers, rig.sizes, strict=True):
         opening = 2 * np.degrees(np.arctan(w / 2 / camera.focal_length_x))
         x, y, z = center
         place = f"{x:.2f}, {y:.2f}, {z:.2f}"
-        rows.append((name, f"{w} × {h}", f"{camera.focal_length_x:.1f}", f"{opening:.0f}", camera.model.name, place))
+        row = (name, f"{w} × {h}", f"{camera.focal_length_x:.1f}", f"{opening:.0f}", camera.model.name, place)
+        rows.append((*row, "contradicts the others") if name in doubtful else (*row, "") if doubtful else row)
     head = ("camera", "size (px)", "camera constant (px)", "opening (°)", "model", "position x, y, z (m)")
-    return table(head, rows, (2, 3))
+    return table((*head, "") if doubtful else head, rows, (2, 3))
+
+
+def camera_remarks(results: Results) -> list[Block]:
+    """Return what was found to be doubtful about the cameras, and which of them the run goes without."""
+    doubts = results.camera_doubts
+    items = [*doubts.warnings]
+    if doubts.left_out:
+        items.append(f"The run goes without {', '.join(doubts.left_out)}.")
+    return [Block("warnings", items=tuple(items))] if items else []
 
 
 def bodies_table(results: Results, frame: int) -> Block:
@@ -101,10 +111,18 @@ def bodies_table(results: Results, frame: int) -> Block:
         if s is not None and body >= 0:
             joints = ", ".join(s.joint_names[j] for j in np.flatnonzero((s.joint_bodies == body).any(axis=1)).tolist())
         confidence = "" if sure is None or not 0 <= body < len(sure) else f"{sure[body]:.2f}"
-        rows.append((f"body {body}" if body >= 0 else "none", fraction, confidence, own, joints))
+        rows.append((_called(results, body), fraction, confidence, own, joints))
         colors.append(hex_color(body_color(body)))
     head = ("body", f"points in frame {frame} (%)", "confidence", "ellipsoids", "joints")
     return table(head, rows, (1, 2, 3), colors)
+
+
+def _called(results: Results, body: int) -> str:
+    """Return what a body is called in the report's tables."""
+    s = results.skeleton
+    if body < 0 or s is None or body >= s.body_count or results.names is None:
+        return f"body {body}" if body >= 0 else "none"
+    return str(s.body_names[body])
 
 
 def summary(quality: Quality) -> list[Block]:
@@ -121,7 +139,7 @@ def verdict(results: Results) -> list[Block]:
     found = read_self_check(results.run)
     if found is None:
         return []
-    word, reasons = found.verdict(tuple(read_warnings(results.run)))
+    word, reasons = found.verdict(tuple(results.remarks))
     words = f"Verdict: {word}."
     if reasons:
         return [Block("warnings", items=(words, *reasons))]

@@ -95,13 +95,14 @@ def joints_table(results: Results) -> Block | None:
     if skeleton is None or kinds is None or axes is None or len(kinds) != skeleton.joint_count:
         return None
     deviations = found.joint_std  # joints of a known subject's model have none
+    called = skeleton.body_names
     rows, colors = [], []
     for j, name in enumerate(skeleton.joint_names):
         hinge = bool(kinds[j])
         axis = ", ".join(f"{v:.2f}" for v in axes[j]) if hinge else ""
         deviation = "" if deviations is None else f"{1000 * float(np.linalg.norm(deviations[j])):.1f}"
         parent, child = skeleton.joint_bodies[j]
-        rows.append((name, f"{parent} – {child}", "hinge" if hinge else "ball", axis, deviation))
+        rows.append((name, f"{called[parent]} – {called[child]}", "hinge" if hinge else "ball", axis, deviation))
         colors.append(hex_color(body_color(int(child))))
     head = ("joint", "bodies", "kind", "axis in frame 0", "standard deviation (mm)")
     return table(head, rows, (4,), colors)

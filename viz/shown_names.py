@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import tomli_w
 
-from geomocap.errors import RunError
+from geomocap.errors import GeomocapError, RunError
 from geomocap.export.export_errors import MotionError
 from geomocap.export.names import Names
-from geomocap.export.run_names import NAMES_FOUND
+from geomocap.export.run_export import run_settings, run_up
+from geomocap.export.run_names import NAMES_FOUND, run_names
 from geomocap.files.atomic import write_text
 from geomocap.model.skeleton import Skeleton
 from viz.run_contents import Results
@@ -22,6 +24,16 @@ def names_of(results: Results) -> Names:
     if file.is_file():
         found = Names.read(file)
     return own.over(found.bodies, found.joints)
+
+
+def named(results: Results) -> Results:
+    """Return a run whose bodies and joints are called as in its motion files; by number if the names can't be used."""
+    try:
+        renamed = replace(results, names=names_of(results))
+        _ = renamed.skeleton
+    except MotionError:
+        return results
+    return renamed
 
 
 def users_names(results: Results) -> Names:
@@ -40,6 +52,14 @@ def joint_names(results: Results, skeleton: Skeleton) -> tuple[str, ...]:
     names = names_of(results)
     bodies = names.body_names(skeleton.body_count, skeleton.body_names)
     return names.joint_names(skeleton.joint_bodies, bodies, skeleton.joint_names)
+
+
+def trunk_of(results: Results, skeleton: Skeleton) -> int | None:
+    """Return the body that the motion files' tree grows from; None: that of the skeleton."""
+    try:
+        return run_names(results.run, skeleton, run_up(results.run), run_settings(results.run))[1].trunk
+    except GeomocapError:
+        return None  # told where motion files are written
 
 
 def rename(results: Results, kind: str, number: int, name: str) -> Path:

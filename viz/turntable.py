@@ -30,7 +30,8 @@ from viz.body_colors import body_color, hex_color
 from viz.camera_pictures import frusta
 from viz.floor import grid_spacing
 from viz.run_contents import Results
-from viz.shown_names import joint_names, names_of
+from viz.shown_angles import angles_of, angles_of_node
+from viz.shown_names import joint_names, names_of, trunk_of
 from viz.viewpoints import ViewStage
 
 SAMPLES = 40_000
@@ -97,7 +98,8 @@ def script_json(data: Any) -> str:
 def motion_of(results: Results, skeleton: Skeleton) -> MotionTree:
     """Return the motion as the run's files have it: a node for each body, in the order of the GLB file."""
     up: Axis = {"x": "x", "y": "y"}.get(results.up, "z")  # type: ignore[assignment]
-    return motion_from_skeleton(skeleton, up=up, names=names_of(results), radius=mean_radius(results.run))
+    radius, root = mean_radius(results.run), trunk_of(results, skeleton)
+    return motion_from_skeleton(skeleton, up=up, names=names_of(results), radius=radius, root=root)
 
 
 def glb_of(results: Results, motion: MotionTree) -> bytes:
@@ -160,14 +162,18 @@ def _places(results: Results, stage: ViewStage, motion: MotionTree) -> dict[str,
 def _nodes(results: Results, skeleton: Skeleton, motion: MotionTree) -> list[dict[str, Any]]:
     """Return what is told of each body and of the joint to its parent."""
     found = results.diagnostics
+    known_angles = angles_of(results)
     sure, std, hinge = found.body_confidence, found.joint_std, found.joint_is_hinge
     called = joint_names(results, skeleton)
     tips = GLB.points(motion.tips, motion.up)
     nodes = []
     for n, name in enumerate(motion.names):
         body, j = int(motion.bodies[n]), int(motion.joints[n])
-        joint = None
+        joint: dict[str, Any] | None = None
+        told: list[dict[str, Any]] = []
         if j >= 0:
+            if known_angles is not None:
+                told = angles_of_node(known_angles[0], int(motion.bodies[motion.parents[n]]), body)
             precise = std is not None and len(std) == skeleton.joint_count and np.isfinite(std[j]).all()
             kind = "joint" if hinge is None or len(hinge) != skeleton.joint_count else ("hinge" if hinge[j] else "ball")
             joint = {
@@ -183,6 +189,7 @@ def _nodes(results: Results, skeleton: Skeleton, motion: MotionTree) -> list[dic
                 "color": hex_color(body_color(body)),
                 "confidence": round(float(sure[body]), 3) if sure is not None and known else None,
                 "joint": joint,
+                "angles": told,
                 "tip": np.round(tips[n], 5).tolist() if np.isfinite(tips[n]).all() else None,
             }
         )

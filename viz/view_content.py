@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
+from geomocap.angles.angle_set import AngleSet
 from geomocap.errors import GeometryError
 from geomocap.evaluation.other_system import read_motion_file
+from geomocap.export.bvh import read_bvh
 from geomocap.export.conventions import Axis
 from geomocap.export.export_errors import MotionError
 from geomocap.export.export_settings import ExportSettings
@@ -25,11 +27,13 @@ from geomocap.files.scan_settings import ScanSettings
 from geomocap.files.scans import open_scans
 from geomocap.inspection.describe import InspectionError
 from geomocap.inspection.motion_files import ENDINGS
+from geomocap.model.ellipsoids import Ellipsoids
 from geomocap.model.rig import Rig
 from viz.drawing import resize
 from viz.keypoint_scene import SceneSurface
 from viz.run_contents import Results
 from viz.scene import stage as stage_of_run
+from viz.shown_angles import angle_words, angles_of
 from viz.shown_names import joint_names
 from viz.turntable import motion_of
 from viz.viewpoints import ViewStage, stage_of, up_vector
@@ -37,6 +41,14 @@ from viz.volumes import spacing
 
 GREY = (150, 156, 165)
 """Colour of points that have none, RGB 0–255."""
+
+
+@dataclass(frozen=True)
+class FollowedPoints:
+    """Points that bodies were found from: places (N, T, 3) metres, and the body of each (N,), -1: none."""
+
+    places: np.ndarray
+    bodies: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -58,6 +70,8 @@ class Content:
     joint_names : tuple of str
         Of the motion's nodes: what the joint at the origin of each is called.
     markers : Markers, optional
+    ellipsoids : Ellipsoids, optional
+    followed : FollowedPoints, optional
     rig : Rig, optional
     picture : callable, optional
         A camera's picture of a frame, made smaller to a width at most: (H, W, 3) uint8.
@@ -74,6 +88,8 @@ class Content:
     mesh: SkinnedMesh | None = None
     joint_names: tuple[str, ...] = ()
     markers: Markers | None = None
+    ellipsoids: Ellipsoids | None = None
+    followed: FollowedPoints | None = None
     rig: Rig | None = None
     picture: Callable[[str, int, int], np.ndarray] | None = None
     results: Results | None = None
@@ -96,6 +112,8 @@ class Content:
         """Points (N, 3) of a frame from whatever is there; the cameras' places if nothing else is."""
         surface = self.points(frame)
         found = [] if surface is None else [surface.points]
+        if self.motion is not None:
+            found.append(self.bone_ends(frame).reshape(-1, 3))
         if self.markers is not None:
             found.append(self.markers.positions[min(frame, len(self.markers.positions) - 1)])
         if not found and self.rig is not None:
@@ -116,6 +134,26 @@ class Content:
         R = self.motion.rotations
         trace = np.einsum("nij,tnij->tn", R[0], R)
         return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+
+    @cached_property
+    def angles(self) -> AngleSet | None:
+        """Joint angles as in the run's motion files."""
+        found = None if self.results is None else angles_of(self.results)
+        return None if found is None else found[0]
+
+    def told_angles(self, node: int, frame: int) -> list[str]:
+        """Return the angles between a node's body and its parent's in a frame, in words."""
+        motion, angles = self.motion, self.angles
+        assert motion is not None
+        if angles is None or motion.parents[node] < 0 or frame >= len(angles.values):
+            return []
+        told = []
+        for k in angles.of_joint(int(motion.bodies[motion.parents[node]]), int(motion.bodies[node])):
+            value, band = angles.values[frame, k], 2 * angles.std[frame, k]
+            if np.isfinite(value):
+                sure = f" ± {band:.1f}" if np.isfinite(band) else ""
+                told.append(f"{angle_words(angles.names[k])} {value:.1f}°{sure}")
+        return told
 
     @cached_property
     def confidence(self) -> np.ndarray:
@@ -175,6 +213,10 @@ def open_content(path: Path, capture: Capture | None = None) -> Content:
     elif path.suffix.lower() in ENDINGS:
         if path.suffix.lower() == ".glb":
             raise InspectionError(f"{path}: GLB files turn in any glTF viewer; give the run or another motion file")
+        if path.suffix.lower() == ".bvh":
+            motion = read_bvh(path)
+            motion = replace(motion, bodies=np.arange(motion.n_nodes))  # each its colour
+            return Content(path.name, motion.n_frames, motion.fps, motion.up, motion=motion, joint_names=motion.names)
         markers = read_motion_file(path)
         return Content(path.name, len(markers.positions), markers.fps, markers.up, markers=markers)
     scans = open_scans(path, ScanSettings())
@@ -218,7 +260,20 @@ def of_run(results: Results) -> Content:
 
     rig, picture = _cameras(results.capture, results.frames)
     title, fps = results.run.path.resolve().name, results.fps or 25.0
-    return Content(title, count, fps, up, points, motion, mesh, called, markers, rig, picture, results)
+    shells = results.ellipsoids if results.ellipsoids is not None and results.ellipsoids.frame_count == count else None
+    return Content(
+        title, count, fps, up, points, motion, mesh, called, markers, shells, _followed(results, count), rig, picture,
+        results,
+    )  # fmt: skip
+
+
+def _followed(results: Results, count: int) -> FollowedPoints | None:
+    """Return the points that were followed through all frames; None if there are none."""
+    places, bodies = results.diagnostics.sample_positions, results.diagnostics.sample_body
+    if places is None or places.ndim != 3 or places.shape[1] != count or not len(places):
+        return None
+    known = bodies is not None and len(bodies) == len(places)
+    return FollowedPoints(places, bodies if bodies is not None and known else np.full(len(places), -1))
 
 
 def of_capture(capture: Capture) -> Content:

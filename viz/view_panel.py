@@ -52,6 +52,8 @@ class ViewPanel:
                 "skeleton": gui.add_checkbox("Skeleton", True, visible=bodies),
                 "trails": gui.add_checkbox("Trails", True, visible=bodies),
                 "names": gui.add_checkbox("Names", False, visible=named),
+                "followed": gui.add_checkbox("Followed points", False, visible=any(c.followed for c in contents)),
+                "ellipsoids": gui.add_checkbox("Ellipsoids", False, visible=any(c.ellipsoids for c in contents)),
                 "points": gui.add_checkbox("Voxels or points", points and not skin, visible=points),
                 "cameras": gui.add_checkbox("Cameras", not bodies, visible=any(c.rig for c in contents)),
             }
@@ -161,6 +163,7 @@ def describe(content: Content, chosen: Chosen, seconds: float) -> tuple[str, str
     lines = [f"**{_plain(name)}**"]
     if chosen.kind == "joint":
         lines.append(f"joins {_plain(motion.names[int(motion.parents[node])])} and {_plain(motion.names[node])}")
+    lines += content.told_angles(node, frame)
     lines.append(f"turned by {content.turns_deg[frame, node]:.1f}° since the first frame")
     if np.isfinite(content.confidence[node]):
         lines.append(f"confidence {content.confidence[node]:.0%}")

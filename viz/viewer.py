@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from geomocap.errors import GeomocapError
-from geomocap.model.palette import body_color
+from geomocap.model.palette import body_color, body_colors
+from viz import shapes
 from viz.floor import grid_spacing
 from viz.keypoint_scene import SceneSurface
 from viz.local_page import serve_page
@@ -61,6 +62,7 @@ class Viewer:
         purpose = "Pages that show a run"
         self.server = serve_page(f"geomocap: {title}", host, port, extra="view", purpose=purpose)
         self.server.scene.world_axes.visible = False
+        self.server.scene.configure_fog(0.0, 1.0, enabled=False)  # large subjects stand far from the eye
         self.chosen: Chosen | None = None
         self.panel = ViewPanel(self.server.gui, self.contents)
         self._shown: list[dict[str, Any]] = []
@@ -110,7 +112,10 @@ class Viewer:
         view = stage.view(30.0, 12.0, (800, 800), _FIELD_DEG)
         R, t = view.cam_from_world[:, :3], view.cam_from_world[:, 3]
         middle = R.T @ (np.array([0, 0, t[2]]) - t) + sum(self._offsets) / len(self._offsets)
-        away = R.T @ np.array([0, 0, t[2]]) * (1.0 if len(self.contents) == 1 else 0.75 * wide / stage.diagonal)
+        away = R.T @ np.array([0, 0, t[2]])
+        if len(self.contents) > 1:  # both beside the panel
+            away *= wide / stage.diagonal
+            middle = middle + 0.2 * wide * R[0]
         first = self.server.initial_camera
         first.look_at, first.position = middle, middle - away
         first.up, first.fov = stage.up, np.radians(1.15 * _FIELD_DEG)
@@ -261,6 +266,8 @@ class Viewer:
                 if known:
                     ball.position, label.position = place, place + self._stages[k].up * 0.02 * self._stages[k].diagonal
         self._cloud(k, content.points(frame) if shows("points") else None)
+        self._followed(k, content, frame)
+        self._ellipsoids(k, content, frame)
         for name, frustum in made["cameras"].items():
             frustum.visible = shows("cameras")
             if shows("cameras") and content.picture is not None:
@@ -276,6 +283,34 @@ class Viewer:
         self.server.scene.add_point_cloud(
             name, shown.points - middle, shown.colors, point_size=1.1 * shown.spacing, point_shape="circle",
             point_shading="flat", position=middle,
+        )  # fmt: skip
+
+    def _followed(self, k: int, content: Content, frame: int) -> None:
+        """Draw the points that the bodies were found from, where they are in this frame."""
+        name, followed = f"/{k}/followed", content.followed
+        places = np.zeros((0, 3)) if followed is None else followed.places[:, frame]
+        seen = np.isfinite(places).all(axis=1)
+        if followed is None or not self.panel.shows("followed") or not seen.any():
+            self._remove(name)
+            return
+        middle = places[seen].mean(axis=0)
+        self.server.scene.add_point_cloud(
+            name, places[seen] - middle, body_colors(followed.bodies[seen]), point_shape="circle", position=middle,
+            point_size=0.004 * self._stages[k].diagonal,
+        )  # fmt: skip
+
+    def _ellipsoids(self, k: int, content: Content, frame: int) -> None:
+        name, shells = f"/{k}/ellipsoids", content.ellipsoids
+        centers = np.zeros((0, 3)) if shells is None else shells.centers[frame]
+        seen = np.isfinite(centers).all(axis=1)
+        if shells is None or not self.panel.shows("ellipsoids") or not seen.any():
+            self._remove(name)
+            return
+        sphere = shapes.ball(np.zeros(3), 1.0, (0, 0, 0), level=3)
+        self.server.scene.add_batched_meshes_simple(
+            name, sphere.vertices, sphere.faces, quaternion(shells.rotations[frame, seen]), centers[seen],
+            batched_scales=shells.radii[frame, seen], batched_colors=body_colors(shells.bodies[seen]), opacity=0.5,
+            lod="off",
         )  # fmt: skip
 
     def _trails(self, k: int, content: Content, frame: int, length: int = 24) -> None:

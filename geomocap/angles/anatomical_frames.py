@@ -43,8 +43,7 @@ def anatomical_frames(skeleton: Skeleton, found: FoundNames) -> AnatomicalFrames
     if template is None or template.name != "human" or not found.sides_known or found.from_world is None:
         return None
     labels = [f"{p}_{s}" if s else p for p, s in zip(template.parts, template.sides, strict=True)]
-    own = {b for b, name in found.bodies.items() if not name.rsplit("_", 1)[-1].isdigit()}
-    bodies = {labels[p]: b for b in sorted(own) for p in found.parts[b]}
+    bodies = {labels[p]: b for b in sorted(found.whole) for p in found.parts[b]}
     joints: dict[str, np.ndarray] = {}
     for j, p in sorted(found.joint_parts.items(), key=lambda one: -found.joint_confidence[one[0]]):
         joints.setdefault(labels[p], skeleton.joint_positions[0, j])

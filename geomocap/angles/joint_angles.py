@@ -17,6 +17,8 @@ from geomocap.model.skeleton import Skeleton
 from geomocap.naming.found_names import FoundNames
 from geomocap.skeleton.hinges import main_axis
 
+Columns = dict[str, tuple[np.ndarray, np.ndarray]]  # values and standard deviations over time, radians
+
 # joint: inner part, outer part, sign of the turn about Z that bends it
 ANATOMICAL = {
     "back": ("pelvis", "thorax", -1.0),
@@ -51,14 +53,17 @@ def joint_angles(
     zero_frame : int, optional
         Frame in which all angles are zero; without it a straight limb has none.
     """
-    columns: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    columns: Columns = {}
+    pairs: dict[str, tuple[int, int]] = {}
     frames = anatomical_frames(skeleton, found)
-    described: set[frozenset[int]] = set()
     if frames is not None:
-        columns, described = _anatomical(skeleton, frames, turn_covariances, zero_frame)
+        columns, pairs = _anatomical(skeleton, frames, turn_covariances, zero_frame)
+    described = {frozenset(pair) for pair in pairs.values()}
     for j, (parent, child) in enumerate(skeleton.joint_bodies.tolist()):
         if frozenset((parent, child)) not in described:
-            columns |= _about_own_axis(skeleton, joint_names[j], parent, child, turn_covariances, zero_frame)
+            own = _about_own_axis(skeleton, joint_names[j], parent, child, turn_covariances, zero_frame)
+            columns |= own
+            pairs |= dict.fromkeys(own, (parent, child))
     values = [np.rad2deg(v) for v, _ in columns.values()]
     std = [np.rad2deg(s) for _, s in columns.values()]
     shape = (skeleton.frame_count, 0)
@@ -67,15 +72,16 @@ def joint_angles(
         np.stack(values, axis=1) if values else np.zeros(shape),
         np.stack(std, axis=1) if std else np.zeros(shape),
         skeleton.fps,
+        np.array([pairs[name] for name in columns], int).reshape(-1, 2),
     )
 
 
 def _anatomical(
     skeleton: Skeleton, frames: AnatomicalFrames, covariances: np.ndarray | None, zero_frame: int | None
-) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], set[frozenset[int]]]:
-    """Angles of the joints between named parts, and the pairs of bodies that they describe."""
-    columns: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    described: set[frozenset[int]] = set()
+) -> tuple[Columns, dict[str, tuple[int, int]]]:
+    """Angles of the joints between named parts, and the two bodies of each."""
+    columns: Columns = {}
+    pairs: dict[str, tuple[int, int]] = {}
     for joint, (inner, outer, bend) in ANATOMICAL.items():
         for side in ("", "_left", "_right"):
             near = inner + side if inner + side in frames.axes else inner
@@ -83,7 +89,6 @@ def _anatomical(
             if near not in frames.axes or far not in frames.axes or frames.bodies[near] == frames.bodies[far]:
                 continue
             a, b = frames.bodies[near], frames.bodies[far]
-            described.add(frozenset((a, b)))
             first = skeleton.body_rotations[:, a] @ frames.axes[near]
             relative = relative_turns(first, skeleton.body_rotations[:, b] @ frames.axes[far])
             if zero_frame is not None:
@@ -100,7 +105,8 @@ def _anatomical(
                 columns[f"{joint}{side}_{kind}"] = signs[i] * angles[:, i], std
             if joint == "shoulder":
                 columns |= _elevation(relative, f"{joint}{side}", inward)
-    return columns, described
+            pairs |= dict.fromkeys(columns.keys() - pairs.keys(), (a, b))
+    return columns, pairs
 
 
 def _known_angles(relative: np.ndarray) -> np.ndarray:
@@ -112,7 +118,7 @@ def _known_angles(relative: np.ndarray) -> np.ndarray:
     return angles
 
 
-def _elevation(relative: np.ndarray, name: str, inward: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _elevation(relative: np.ndarray, name: str, inward: float) -> Columns:
     """Plane of elevation (0: to the side, 90°: to the front) and elevation of an upper arm."""
     down = -relative[:, :, 1]
     plane = np.arctan2(down[:, 0], inward * down[:, 2])
@@ -125,7 +131,7 @@ def _elevation(relative: np.ndarray, name: str, inward: float) -> dict[str, tupl
 
 def _about_own_axis(
     skeleton: Skeleton, name: str, parent: int, child: int, covariances: np.ndarray | None, zero_frame: int | None
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+) -> Columns:
     """Turn of a joint about its main axis since a frame, and the size of what is left."""
     relative = relative_turns(skeleton.body_rotations[:, parent], skeleton.body_rotations[:, child])
     relative = relative @ relative[zero_frame or 0].T

@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from geomocap.angles.anatomical_frames import anatomical_frames
 from geomocap.angles.angle_set import AngleSet
 from geomocap.export.angle_files import angle_table, run_angles, write_mot
 from geomocap.export.bvh import write_bvh
@@ -25,6 +26,7 @@ from geomocap.export.motion_tree import MotionTree
 from geomocap.export.movement_dataset import write_movement
 from geomocap.export.names import Names
 from geomocap.export.osim import OSIM, write_osim
+from geomocap.export.osim_markers import write_osim_markers
 from geomocap.export.rest_pose import at_rest
 from geomocap.export.run_names import NAMES_FOUND, names_text, run_names
 from geomocap.export.skeleton_motion import UNKNOWN_RADIUS, motion_from_skeleton
@@ -130,23 +132,23 @@ def export_run(
     skeleton = read_skeleton(run)
     up = run_up(run)
     names, found = (names, FoundNames()) if names is not None else run_names(run, skeleton, up, settings)
-    motion = motion_from_skeleton(skeleton, up=up, names=names, joints=settings.joints, radius=mean_radius(run))
+    radius, root = mean_radius(run), found.trunk
+    motion = motion_from_skeleton(skeleton, up=up, names=names, joints=settings.joints, radius=radius, root=root)
     markers = run_markers(run, skeleton, names, up, ellipsoids=settings.ellipsoids)
     mesh = surface_of_run(run, motion, settings)
-    shown, skinned = at_rest(motion, mesh, found, settings.rest_pose)
+    shown, skinned = at_rest(motion, mesh, found, settings.rest_pose, anatomical_frames(skeleton, found))
 
     def links(convention: Convention) -> LinkedBodies:
-        fixed = motion_from_skeleton(skeleton, up=up, names=names, joints="fixed", radius=mean_radius(run))
+        fixed = motion_from_skeleton(skeleton, up=up, names=names, joints="fixed", radius=radius, root=root)
         bodies = (names or Names()).body_names(skeleton.body_count, skeleton.body_names)
         labels = (names or Names()).joint_names(skeleton.joint_bodies, bodies, skeleton.joint_names)
-        density, radius = settings.density, mean_radius(run)
-        return linked_bodies(fixed, mesh, labels, convention, density=density, radius=radius)
+        return linked_bodies(fixed, mesh, labels, convention, density=settings.density, radius=radius)
 
     angles = run_angles(run, skeleton, names, found, settings)
     writers = _writers(motion, markers, shown, skinned, settings) | {
         "angles": lambda path: write_csv(path, angle_table(angles)),
         "mot": lambda path: write_mot(path, angles),
-        "osim": lambda path: write_osim(path, links(OSIM)),
+        "osim": lambda path: _write_osim(path, links(OSIM), found, markers.names[: skeleton.joint_count]),
         "urdf": lambda path: write_urdf(path, links(URDF)),
         "fbx": lambda path: _write_fbx(path, shown, skinned),
         "movement": lambda path: write_movement(path, markers),
@@ -207,6 +209,11 @@ def surface_of_run(run: Run, motion: MotionTree, settings: ExportSettings) -> Sk
     if (run.path / MODEL_FILE).is_file() and settings.skin_frame == 0:
         return skin_from_model(read_model(run.path / MODEL_FILE), motion, settings)
     return skin_from_run(run, motion, settings) if settings.surface == "skin" else None
+
+
+def _write_osim(path: Path, bodies: LinkedBodies, found: FoundNames, labels: tuple[str, ...]) -> None:
+    write_osim(path, bodies)
+    write_osim_markers(path.with_name(f"{path.stem}_markers.xml"), found, labels)
 
 
 def _write_fbx(path: Path, motion: MotionTree, mesh: SkinnedMesh | None) -> None:

@@ -7,7 +7,7 @@ in every frame, so that the skeleton's joints are always met.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -32,6 +32,7 @@ def motion_from_skeleton(
     names: Names | None = None,
     joints: JointMode = "auto",
     radius: float = UNKNOWN_RADIUS,
+    root: int | None = None,
 ) -> MotionTree:
     """Make a motion of a skeleton.
 
@@ -49,6 +50,8 @@ def motion_from_skeleton(
         translation in every frame. auto: only those nodes get it that no constant offset reproduces within 0.01 mm.
     radius : float, metres
         Size of a single body, which a skeleton without joints can't tell; its bone is as long.
+    root : int, optional
+        Body that the tree grows from; by default the skeleton's.
 
     Raises
     ------
@@ -57,12 +60,16 @@ def motion_from_skeleton(
     """
     body_names = (names or Names()).body_names(skeleton.body_count, skeleton.body_names)
     rotations = np.stack([fill_rotations(r) for r in skeleton.body_rotations.swapaxes(0, 1)], axis=1)
-    tree = skeleton.hierarchy
-    chain = _Chain(tree, rotations, skeleton.joint_positions, skeleton.body_positions, joints, up, radius)
+    tree, numbers = skeleton.hierarchy, np.arange(skeleton.joint_count)
+    if root is not None and root != tree.root:
+        tree, numbers = tree.grown_from(root)
+    joint_positions = skeleton.joint_positions[:, numbers]
+    chain = _Chain(tree, rotations, joint_positions, skeleton.body_positions, joints, up, radius)
     chain.add_root(body_names[tree.root], tree.root)
     for body in tree.order[1:]:
         chain.add_joint(body_names[body], int(tree.parents[body]), body, int(tree.body_joints[body]))
-    return chain.motion(skeleton.fps)
+    motion = chain.motion(skeleton.fps)
+    return replace(motion, joints=np.array([numbers[j] if j >= 0 else -1 for j in motion.joints.tolist()]))
 
 
 @dataclass(frozen=True)

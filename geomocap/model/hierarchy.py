@@ -55,6 +55,19 @@ class Hierarchy:
             stack.extend(reversed(children.get(order[-1], [])))
         return order
 
+    def grown_from(self, root: int) -> tuple[Hierarchy, np.ndarray]:
+        """Return the same tree with another body as root, and the number that each of its joints has here, (J,) int."""
+        pairs: list[tuple[int, int]] = []
+        numbers: list[int] = []
+        reached = [root]
+        for body in reached:
+            for j, (a, b) in enumerate(self.joint_bodies.tolist()):
+                if body in (a, b) and a + b - body not in reached:
+                    reached.append(a + b - body)
+                    pairs.append((body, a + b - body))
+                    numbers.append(j)
+        return Hierarchy(root, np.array(pairs, np.int32).reshape(-1, 2)), np.array(numbers, int)
+
     def local_rotations(self, rotations: np.ndarray) -> np.ndarray:
         """Rotation of each body relative to its parent's frame; the root's relative to the world.
 

@@ -67,6 +67,16 @@ class FoundNames:
     from_world: np.ndarray | None = None
     scores: dict[str, float] = field(default_factory=dict)
 
+    @property
+    def whole(self) -> dict[int, str]:
+        """Names of the bodies that are not what was cut off from a part, as thigh_left_2."""
+        return {b: name for b, name in self.bodies.items() if not name.rsplit("_", 1)[-1].isdigit()}
+
+    @property
+    def trunk(self) -> int | None:
+        """The body that the template's tree grows from, as the pelvis of a person; None if it isn't named."""
+        return next((b for b in sorted(self.whole) if 0 in self.parts[b]), None)
+
 
 def find_names(
     skeleton: Skeleton,

@@ -21,18 +21,21 @@ class NameSet:
     ----------
     template : str
     bodies, joints : dict of part with side (thigh_left) to name
+    origins : dict of the same to name
+        The program's body in whose origin the joint lies by which a part begins, where the program has such models.
     """
 
     template: str
     bodies: dict[str, str]
     joints: dict[str, str]
+    origins: dict[str, str]
 
 
 def read_name_set(name: str) -> NameSet:
     """Read a set that comes with the package."""
     text = (resources.files("geomocap.naming") / "name_sets" / f"{name}.toml").read_text(encoding="utf-8")
     table = tomllib.loads(text)
-    return NameSet(table["template"], table.get("bodies", {}), table.get("joints", {}))
+    return NameSet(table["template"], table.get("bodies", {}), table.get("joints", {}), table.get("origins", {}))
 
 
 def renamed(found: FoundNames, name_set: NameSetName) -> FoundNames:
@@ -52,8 +55,7 @@ def renamed(found: FoundNames, name_set: NameSetName) -> FoundNames:
     if words.template != found.template.name:
         return found
     first = {body: min(parts) for body, parts in found.parts.items()}
-    own = {body: name for body, name in found.bodies.items() if not name.rsplit("_", 1)[-1].isdigit()}
-    bodies = found.bodies | _words(((b, first[b]) for b in own), words.bodies, found)
+    bodies = found.bodies | _words(((b, first[b]) for b in found.whole), words.bodies, found)
     joints = found.joints | _words(found.joint_parts.items(), words.joints, found)
     return replace(found, bodies=bodies, joints=joints)
 

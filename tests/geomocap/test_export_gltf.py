@@ -1,3 +1,7 @@
+import json
+import shutil
+import subprocess
+
 import numpy as np
 import pygltflib
 import pytest
@@ -104,3 +108,40 @@ def test_faces_look_outwards():
     mesh = bone_mesh(motion_from_skeleton(articulated_skeleton(n_bodies=1, n_frames=2)))
     outward = np.sum((mesh.vertices - mesh.vertices.mean(axis=0)) * mesh.normals, axis=1)
     assert (outward > 0).all()
+
+
+VALIDATE = """
+const fs = require("fs");
+const validator = require("gltf-validator");
+validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2]))).then((r) => console.log(JSON.stringify(r)));
+"""
+
+
+def validated(file, tmp_path):
+    """What Khronos' own validator says of a file: npm package gltf-validator, found by way of NODE_PATH."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("Khronos' validator needs Node.js")
+    script = tmp_path / "validate.cjs"
+    script.write_text(VALIDATE)
+    done = subprocess.run([node, str(script), str(file)], capture_output=True, text=True, timeout=120)
+    if "Cannot find module 'gltf-validator'" in done.stderr:
+        pytest.skip("no gltf-validator (npm install gltf-validator, and its node_modules in NODE_PATH)")
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("kind", [{}, {"jump_mm": 15.0}, {"n_bodies": 1}])
+@pytest.mark.parametrize("skinned", [True, False])
+def test_the_khronos_validator_finds_nothing(tmp_path, kind, skinned):
+    motion = motion_from_skeleton(skeleton_of(skeleton_arrays(**kind)))
+    write_glb(tmp_path / "m.glb", motion, bone_mesh(motion) if skinned else None)
+    report = validated(tmp_path / "m.glb", tmp_path)
+    assert report["info"]["animationCount"] == 1
+    assert report["issues"]["messages"] == []
+
+
+def test_the_khronos_validator_sees_a_damaged_file(tmp_path):
+    write_glb(tmp_path / "m.glb", motion_from_skeleton(articulated_skeleton()))
+    data = (tmp_path / "m.glb").read_bytes()
+    (tmp_path / "m.glb").write_bytes(data.replace(b'"VEC4"', b'"VEC3"', 1))
+    assert validated(tmp_path / "m.glb", tmp_path)["issues"]["numErrors"] > 0

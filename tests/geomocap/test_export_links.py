@@ -8,16 +8,20 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from geomocap.export.export_settings import ExportSettings
 from geomocap.export.linked_bodies import linked_bodies, solid_properties
 from geomocap.export.osim import OSIM, xyz_angles
 from geomocap.export.run_export import ON_REQUEST, export_run
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.skinned_mesh import bone_mesh
 from geomocap.export.stl import write_stl
+from geomocap.export.trc import read_trc
 from geomocap.export.urdf import URDF, safe_name, write_urdf
 from geomocap.files.run import Run
 from geomocap.model.rotations import rotation_about
+from geomocap.naming.name_templates import read_template
 from tests.geomocap.articulated import skeleton_arrays, skeleton_of
+from tests.geomocap.template_figures import figure
 
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
@@ -171,3 +175,50 @@ def test_stl_is_read_back(tmp_path):
     again = trimesh.load_mesh(tmp_path / "box.stl")
     assert again.volume == pytest.approx(6)
     assert again.is_watertight
+
+
+def person(tmp_path):
+    """A run of a walking person."""
+    skeleton, _ = figure(read_template("human"))
+    run = Run(tmp_path / "person")
+    fields = ("joint_positions", "joint_bodies", "joint_names", "body_rotations", "body_positions", "fps")
+    run.write_npz("skeleton.npz", **{name: getattr(skeleton, name) for name in fields})
+    run.write_record({"source": {"up": "z"}})
+    return run
+
+
+def test_markers_sit_where_opensims_bodies_begin(run, tmp_path):
+    export_run(run, ["osim"])
+    assert not (run.path / "motion_markers.xml").exists()  # a body like no person
+    walker = person(tmp_path)
+    files = export_run(walker, ["osim", "trc"], ExportSettings(name_set="opensim")).files
+    markers = Xml.parse(files["osim"].with_name("motion_markers.xml")).iter("Marker")
+    places = {m.get("name"): m.find("socket_parent_frame").text for m in markers}
+    assert len(places) == 13 and places["hip_r"] == "/bodyset/femur_r" and places["elbow_l"] == "/bodyset/ulna_l"
+    assert set(places) <= set(read_trc(files["trc"]).names)
+
+
+def test_opensims_inverse_kinematics_follows_the_markers(tmp_path):
+    """On the subject's own model, whose forearms and feet are radius and calcaneus: there the markers must be met."""
+    osim = pytest.importorskip("opensim")
+    walker = person(tmp_path)
+    files = export_run(walker, ["osim", "trc"], ExportSettings(name_set="opensim")).files
+    markers = files["osim"].with_name("motion_markers.xml")
+    markers.write_text(markers.read_text().replace("/ulna_", "/radius_").replace("/talus_", "/calcn_"))
+    model = osim.Model(str(files["osim"]))
+    model.updateMarkerSet(osim.MarkerSet(str(markers)))
+    model.initSystem()
+    tool = osim.InverseKinematicsTool()
+    tool.setModel(model)
+    tool.setMarkerDataFileName(str(files["trc"]))
+    tool.set_report_marker_locations(True)
+    tool.setResultsDir(str(tmp_path))
+    tool.setOutputMotionFileName(str(tmp_path / "found.mot"))
+    tool.run()
+    found = osim.TimeSeriesTable(str(tmp_path / "found.mot"))
+    true = columns(files["osim"].with_suffix(".mot"), "\t")
+    assert found.getNumRows() == len(true["time"])
+    knee = np.rad2deg(true["walker_knee_r"])
+    assert np.ptp(knee) > 10
+    measured = found.getDependentColumn("walker_knee_r").to_numpy()
+    assert np.abs(measured - knee).max() < 0.5

@@ -1,8 +1,12 @@
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from geomocap.angles.anatomical_frames import anatomical_frames
+from geomocap.angles.joint_angles import joint_angles
 from geomocap.export.export_errors import MotionError
 from geomocap.export.export_settings import ExportSettings
 from geomocap.export.rest_pose import at_rest
@@ -176,6 +180,68 @@ def test_the_users_names_go_first_and_none_means_numbers(run, tmp_path):
         export_run(run, ["trc"], ExportSettings(names="snail"))
 
 
+def test_the_tree_of_a_person_grows_from_the_pelvis():
+    skeleton, labels = figure(HUMAN)
+    arms = skeleton.joint_bodies[labels.index("upper_arm_left") - 1, 0]
+    hierarchy, numbers = skeleton.hierarchy.grown_from(int(arms))
+    other = replace(
+        skeleton,
+        root=int(arms),
+        joint_bodies=hierarchy.joint_bodies,
+        joint_positions=skeleton.joint_positions[:, numbers],
+    )
+    found = find_names(other, 2)
+    assert found.bodies[found.trunk] == "pelvis"
+    motion = motion_from_skeleton(other, root=found.trunk)
+    assert motion.bodies[0] == found.trunk and motion.parents[0] == -1
+    assert motion.largest_deviation_mm(other.joint_positions) < 1e-6
+    assert not motion.moving[1:].any()
+    joints = {
+        found.bodies[int(b)]: found.joints[int(j)] for b, j in zip(motion.bodies[1:], motion.joints[1:], strict=True)
+    }
+    assert joints["thorax"] == "back" and joints["thigh_left"] == "hip_left"
+    R, _ = motion.forward_kinematics()
+    assert np.abs(R - other.body_rotations[:, motion.bodies]).max() < 1e-12
+
+
+@pytest.mark.parametrize("pose", ["T", "A"])
+def test_a_rest_pose_is_the_same_whatever_the_first_frame(pose):
+    skeleton, labels = figure(HUMAN, turn=0.7)
+    turned = []
+    for first in (0, 6):
+        rotations = skeleton.body_rotations[first:] @ np.swapaxes(skeleton.body_rotations[first], 1, 2)
+        # joints and centres stay where they are; only the frame in which nothing is turned is another one
+        begun = replace(
+            skeleton,
+            body_rotations=rotations,
+            joint_positions=skeleton.joint_positions[first:],
+            body_positions=skeleton.body_positions[first:],
+        )
+        found = find_names(begun, 2)
+        frames = anatomical_frames(begun, found)
+        rested, _ = at_rest(motion_from_skeleton(begun), None, found, pose, frames)
+        R, _ = rested.forward_kinematics()
+        node = {labels[b]: n for n, b in enumerate(rested.bodies)}
+        turned.append({name: R[-1, node["pelvis"]].T @ R[-1, n] for name, n in node.items()})
+    for name in ("upper_arm_left", "upper_arm_right", "forearm_left", "forearm_right", "thorax"):
+        between = Rotation.from_matrix(turned[0][name] @ turned[1][name].T)
+        assert np.rad2deg(between.magnitude()) < 2, name
+
+
+def test_elbows_bend_forward_in_a_rest_pose():
+    skeleton, labels = figure(HUMAN, turn=0.7)
+    found = find_names(skeleton, 2)
+    frames = anatomical_frames(skeleton, found)
+    rested, _ = at_rest(motion_from_skeleton(skeleton), None, found, "T", frames)
+    R, _ = rested.forward_kinematics()
+    elbow = {labels[b]: n for n, b in enumerate(rested.bodies)}["forearm_left"]
+    t = int(np.argmax(joint_angles(skeleton, found, tuple(skeleton.joint_names)).column("elbow_left_flexion")))
+    bent = np.einsum("tji,tjk->tik", R[:, rested.parents[elbow]], R[:, elbow])[t]
+    hand = bent @ np.array([1.0, 0, 0])  # the forearm points to the left in the pose, which looks along -y
+    forward, up = -hand[1], abs(hand[2])
+    assert forward > 0.2 and up < forward / 2
+
+
 @pytest.mark.parametrize("pose", ["T", "A"])
 def test_a_rest_pose_changes_the_skeleton_but_not_the_motion(pose):
     skeleton, labels = figure(HUMAN, turn=0.7)
@@ -190,7 +256,7 @@ def test_a_rest_pose_changes_the_skeleton_but_not_the_motion(pose):
     R, p = rested.bind_pose(None)
     assert np.abs(R - np.eye(3)).max() == 0
     place = {labels[b]: p[n] for n, b in enumerate(rested.bodies)}
-    left = np.array([-np.sin(0.7), np.cos(0.7), 0])
+    left = np.array([1.0, 0, 0])  # the pose looks along -y, +z of the files
     along = place["hand_left"] - place["upper_arm_left"]
     wanted = left if pose == "T" else (left - [0, 0, 1]) / np.sqrt(2)
     assert along @ wanted > 0.98 * np.linalg.norm(along)

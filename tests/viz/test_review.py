@@ -15,12 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError, RunError
 from geomocap.files.atomic import write_text
+from geomocap.files.camera_file import CameraDoubts, write_camera_doubts
 from geomocap.files.frame_files import ply_count, read_points
 from geomocap.files.run import Run
 from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.rotations import rotation_vectors
 from tests.viz.conftest import LIMBS, Made
 from viz import render_file, review, scene
+from viz.camera_pictures import frusta
 from viz.drawing import write_png
 from viz.figures import joint_angles
 from viz.films import best_camera, motion_video, write_video
@@ -28,8 +30,9 @@ from viz.quality_figures import assess, coverage, relative_paths
 from viz.report import Block, Report, Section, render_html, table, video
 from viz.run_contents import Results
 from viz.scene import stage
-from viz.sections import changed_files
+from viz.sections import bodies_table, camera_remarks, cameras_table, changed_files
 from viz.sheets import overlay, path_sheet
+from viz.shown_names import named
 
 
 @pytest.fixture(scope="session")
@@ -91,6 +94,29 @@ def test_pictures_repeat_to_the_bit(made: Made, reviewed: list[Path], tmp_path: 
     assert (tmp_path / "paths.png").read_bytes() == (made.run.path / "review" / "paths.png").read_bytes()
     assert results.skeleton is not None
     assert joint_angles(results.skeleton, 30.0) == (made.run.path / "review" / "joint_angles.png").read_bytes()
+
+
+def test_cameras_that_contradict_and_names_are_told(made: Made, tmp_path: Path) -> None:
+    run = Run(shutil.copytree(made.run.path, tmp_path / "run"))
+    word = "cam1 contradicts the others: it seems mirrored"
+    write_camera_doubts(run, CameraDoubts(("cam1",), (), (word,)))
+    (run.path / "names.toml").write_text('[bodies]\n"left_shin" = 7\n[joints]\n"left_knee" = 6\n')
+    results = named(Results(run, made.capture))
+    assert word in assess(results, [0]).warnings
+    (block,) = camera_remarks(results)
+    assert block.items == (word,)
+    cells = {row[0]: row[-1] for row in cameras_table(results).rows}
+    assert cells == {"cam0": "", "cam1": "contradicts the others", "cam2": ""}
+    data = frusta(results, "z")["cameras"]
+    assert [c["doubtful"] for c in data] == [False, True, False]
+    told = bodies_table(results, 0)
+    assert told.rows[7][0] == "left_shin" and "left_knee" in told.rows[7][-1]
+    (run.path / "names.toml").write_text('"no name" = 7\n')
+    assert bodies_table(named(Results(run, made.capture)), 0).rows[7][0] == "body 7"
+    write_camera_doubts(run, CameraDoubts(("cam1",), ("cam1",), (word,)))
+    (block,) = camera_remarks(Results(run, made.capture))
+    assert "without cam1" in block.items[-1]
+    assert camera_remarks(Results(made.run, made.capture)) == []
 
 
 def test_files_that_are_not_as_they_were_written_are_named(tmp_path: Path) -> None:

@@ -13,6 +13,8 @@ import pygltflib
 import pytest
 
 from geomocap.export.conventions import GLB
+from geomocap.export.run_export import export_run
+from geomocap.files.results import read_skeleton
 from geomocap.files.run import Run
 from tests.viz.chromium import Page, chromium
 from tests.viz.conftest import LIMBS, Made, make
@@ -22,6 +24,7 @@ from viz.run_contents import Results
 from viz.scene import stage
 from viz.sections import section
 from viz.sheets import still
+from viz.shown_names import body_names
 from viz.turntable import Turntable, glb_of, motion_of, script_json, turntable
 
 HOSTILE = "</script><img/src=x/onerror=alert(1)>"
@@ -70,6 +73,24 @@ def test_nodes_are_those_of_the_file_with_the_users_names(scene, turns):
     assert head["joint"]["name"] == "<i>neck<i>" and head["confidence"] == pytest.approx(0.5 + 0.5 / 9, abs=1e-3)
     assert [n["parent"] for n in data["nodes"]].count(-1) == 1
     assert data["frames"] == list(range(FRAMES)) and data["fps"] == 30
+
+
+def test_angles_of_a_joint_are_those_of_the_motion_files(scene, turns):
+    exported = export_run(scene.run, ["angles"], folder=scene.run.path / "angles only")
+    angles, skeleton = exported.angles, read_skeleton(scene.run)
+    data = json.loads(turns.data)
+    for j, (parent, child) in enumerate(skeleton.joint_bodies.tolist()):
+        node = next(n for n in data["nodes"] if n["joint"] and n["name"] == named_bodies(scene)[child])
+        told = {a["name"]: a for a in node["angles"]}
+        assert set(told) == {"turn about its axis", "about other axes"}, (j, parent)
+        column = angles.of_joint(parent, child)[0]
+        assert angles.names[column].endswith("_turn")
+        assert told["turn about its axis"]["values"] == pytest.approx(angles.values[:, column], abs=0.006)
+        assert (told["turn about its axis"]["std"] is None) == bool(np.isnan(angles.std[:, column]).all())
+
+
+def named_bodies(scene: Made) -> tuple[str, ...]:
+    return body_names(Results(scene.run), read_skeleton(scene.run))
 
 
 def test_followed_points_come_back_from_their_quantised_places(scene, turns):
@@ -201,6 +222,7 @@ def test_the_subject_is_drawn_turned_played_and_taken_apart(page_file):
         told = page.run("document.querySelector('#turntable .card').textContent")
         names = {limb[0] for limb in LIMBS} | {"skull"} | {f"body{b:02d}" for b in range(len(LIMBS))}
         assert page.run("document.querySelector('#turntable').dataset.chosen") in names and "confidence" in told
+        assert "turn about its axis" in told or "turned0" in told
         page.run("document.querySelector('#turntable .close').click()")
         page.mouse("mouseMoved", x + w / 2, y + h + 20)  # what is pointed at is darker
         np.testing.assert_array_equal(shown(page), whole)

@@ -63,7 +63,8 @@ def test_captures_calibrations_scans_and_motion_files_open(made, run, tmp_path):
     assert calibration.rig is not None and calibration.picture is None
     export_run(run, ["trc", "bvh"])
     trc, bvh = open_content(run.path / "motion.trc"), open_content(run.path / "motion.bvh")
-    assert trc.markers is not None and trc.up == "y" and trc.n_frames == 6 and bvh.markers is not None
+    assert trc.markers is not None and trc.up == "y" and trc.n_frames == 6
+    assert bvh.motion is not None and bvh.bone_ends(3).shape[1:] == (2, 3) and len(bvh.stage.points)
     scans = tmp_path / "scans"
     scans.mkdir()
     for t in range(3):
@@ -120,6 +121,28 @@ def test_what_is_chosen_is_told_with_its_angle_and_confidence(made, run):
     angle = np.degrees(np.arccos((np.trace(turn[0].T @ turn[5]) - 1) / 2))
     assert name == "<b>_elbow*" and "<b>" not in words and r"\<b\>\_elbow\*" in words
     assert f"turned by {angle:.1f}°" in words and f"confidence {0.5 + 0.05 * child:.0%}" in words
+    assert f"turn about its axis {angle:.1f}°" in words.replace("-", "")
+
+
+def test_all_of_a_run_can_be_drawn(made, run):
+    points, body = made.figure.points(0, 30)
+    places = np.repeat(points[:, None], 6, axis=1)
+    places[7] = np.nan
+    run.write_npz("diagnostics.npz", sample_positions=places, sample_body=body)
+    content = of_run(Results(run, made.capture))
+    assert content.followed is not None and content.followed.places.shape == (300, 6, 3)
+    assert content.ellipsoids is not None and len(content.ellipsoids) == 20
+    with served(content) as viewer:
+        for layer in viewer.panel._shows.values():
+            layer.value = True
+        viewer.draw()
+        for name in ("followed", "ellipsoids", "points", "bones"):
+            assert viewer.server.scene.get_handle_by_name(f"/0/{name}") is not None, name
+        assert len(viewer.server.scene.get_handle_by_name("/0/followed").points) == 299
+        for layer in viewer.panel._shows.values():
+            layer.value = False
+        viewer.draw()
+        assert viewer.server.scene.get_handle_by_name("/0/ellipsoids") is None
 
 
 # --- names ---

@@ -262,7 +262,7 @@ function makeCameras() {
     at.forEach((p, k) => ends.push(center, p, p, at[(k + 1) % 4]));
     segments.setPositions(ends.flatMap((p) => p.toArray()));
     const wires = new THREE.LineSegments2(segments, new THREE.LineMaterial({ linewidth: 1.5 }));
-    const label = addLabel(camera.name, "camera", () => (state.layers.cameras && state.through < 0 ? center : null));
+    const label = addLabel(camera.doubtful ? `${camera.name} contradicts the others` : camera.name, camera.doubtful ? "camera doubtful" : "camera", () => (state.layers.cameras && state.through < 0 ? center : null));
     rig.group.add(wires, picture);
     const entry = { ...camera, center, corners, picture, wires, label, depth, loaded: new Map() };
     entry.place = (d) => {
@@ -447,7 +447,11 @@ function words(id) {
   const lines = [];
   const percent = (v) => `${Math.round(100 * v)} %`;
   if (isJoint) lines.push([node.joint.kind, `${data.nodes[node.parent].name} – ${node.name}`]);
-  lines.push([node.parent >= 0 ? "turned in its joint" : "turned", `${angle.toFixed(1)}°`]);
+  node.angles.forEach((a) => {
+    const value = a.values[frameNow()], std = a.std && a.std[frameNow()];
+    if (value !== null) lines.push([a.name, `${value.toFixed(1)}°${std ? ` ± ${(2 * std).toFixed(1)}` : ""}`]);
+  });
+  lines.push([node.parent >= 0 ? "turned since the first frame" : "turned", `${angle.toFixed(1)}°`]);
   if (isJoint && node.joint.std !== null) lines.push(["joint known to", `± ${node.joint.std.toFixed(1)} mm`]);
   if (node.confidence !== null) lines.push(["confidence", percent(node.confidence)]);
   return { title: isJoint ? node.joint.name : node.name, color: node.color, lines, n };
@@ -464,13 +468,24 @@ function fill(dom, told) {
 }
 function curve(n) {
   const T = data.frames.length, N = subject.nodes.length, svg = (tag) => document.createElementNS("http://www.w3.org/2000/svg", tag);
-  const values = Array.from({ length: T }, (_, t) => subject.angles[t * N + n]), top = Math.max(10, ...values);
-  const made = svg("svg"), line = svg("polyline"), now = svg("line");
+  const told = data.nodes[n].angles[0];  // flexion, or the turn about a joint's own axis
+  const values = told ? told.values : Array.from({ length: T }, (_, t) => subject.angles[t * N + n]);
+  const known = values.filter((v) => v !== null), low = Math.min(0, ...known), high = Math.max(10, ...known);
+  const made = svg("svg"), line = svg("polyline"), now = svg("line"), band = svg("polygon");
   made.setAttribute("viewBox", "0 0 200 46");
   made.setAttribute("preserveAspectRatio", "none");
   const x = (t) => (200 * t) / Math.max(1, T - 1);
-  line.setAttribute("points", values.map((v, t) => `${x(t).toFixed(1)},${(44 - (40 * v) / top).toFixed(1)}`).join(" "));
+  const y = (v) => (44 - (40 * (v - low)) / (high - low)).toFixed(1);
+  const at = (t, v) => (v === null ? [] : [`${x(t).toFixed(1)},${y(v)}`]);
+  line.setAttribute("points", values.flatMap((v, t) => at(t, v)).join(" "));
   line.setAttribute("stroke", data.nodes[n].color);
+  if (told && told.std) {
+    const edge = (sign) => values.flatMap((v, t) => (v === null || told.std[t] === null ? [] : at(t, v + sign * 2 * told.std[t])));
+    band.setAttribute("points", [...edge(1), ...edge(-1).reverse()].join(" "));
+    band.setAttribute("fill", data.nodes[n].color);
+    band.setAttribute("opacity", "0.25");
+    made.append(band);
+  }
   now.setAttribute("x1", x(frameNow())); now.setAttribute("x2", x(frameNow())); now.setAttribute("y1", 0); now.setAttribute("y2", 46);
   now.setAttribute("class", "now");
   made.append(line, now);
@@ -748,7 +763,7 @@ function colors() {
   paper.set(value("--stage"));
   subject.joints.color.set(value("--joint"));
   shade.material.opacity = Number(value("--shade")) || 0.2;
-  rig.cameras.forEach((camera) => camera.wires.material.color.set(value("--accent")));
+  rig.cameras.forEach((camera) => camera.wires.material.color.set(value(camera.doubtful ? "--warn" : "--accent")));
 }
 
 new THREE.GLTFLoader().parse(bytesOf(byId("turntable-glb").textContent.trim()).buffer, "", (gltf) => {
