@@ -25,6 +25,7 @@ _LEAST_SAMPLES = 20
 _CERTAIN = 0.3
 _SETTLE_ROUNDS = 3
 _EARLY_FRACTION = 0.8  # small groups may still grow
+_IS_ONE = 0.5  # confidence of a body that explains just what is required
 _FEIGNED = 7.81  # 95th percentile of χ² of the three angles of a turn by noise
 _ARM = 0.4  # radii
 _MOST_RADIUS = 3.0  # times the radius asked for
@@ -167,12 +168,24 @@ def find_motion_bodies(
     progress(_STAGE, 3, 4)
     # Those that are there
     criterion = _criterion(settings, noise, rigid=paths.parts is not None)
-    left = eliminate(model, evidence, criterion, settings.bodies or None)
-    model = reassign(left.model, left.evidence, 3).compact()
-    confidence = confidences(model, left.evidence, criterion)
+    model, evidence, curve, confidence = _those_that_are_there(model, evidence, criterion, settings.bodies)
     progress(_STAGE, 4, 4)
-    evidence = replace(left.evidence, positions=positions)
-    return _result(model, evidence, paths, graph, left.curve, linkage, diagonal, confidence, noise)
+    evidence = replace(evidence, positions=positions)
+    return _result(model, evidence, paths, graph, curve, linkage, diagonal, confidence, noise)
+
+
+def _those_that_are_there(
+    model: BodyModel, evidence: Evidence, criterion: Criterion, count: int
+) -> tuple[BodyModel, Evidence, tuple[EliminationStep, ...], np.ndarray]:
+    """Take bodies away until each is one, also after samples have chosen their bodies anew; `count` 0: found."""
+    curve: tuple[EliminationStep, ...] = ()
+    while True:
+        left = eliminate(model, evidence, criterion, count or None)
+        curve = (*(step for step in curve if step.bodies > left.curve[0].bodies), *left.curve)
+        model, evidence = reassign(left.model, left.evidence, 3).compact(), left.evidence
+        confidence = confidences(model, evidence, criterion)
+        if count or (confidence >= _IS_ONE).all():
+            return model, evidence, curve, confidence
 
 
 def _criterion(settings: MotionBodiesSettings, noise: SurfaceNoise, rigid: bool) -> Criterion:
