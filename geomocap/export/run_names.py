@@ -10,6 +10,7 @@ from geomocap.export.names import Names
 from geomocap.files.run import Run
 from geomocap.model.skeleton import Skeleton
 from geomocap.naming.found_names import FoundNames, find_names
+from geomocap.naming.given_names import with_given
 from geomocap.naming.mean_posture import BodySurface
 from geomocap.naming.name_sets import renamed
 from geomocap.naming.name_templates import NamingError, built_in_templates, is_template, read_template
@@ -48,10 +49,13 @@ def run_names(run: Run, skeleton: Skeleton, up: Axis, settings: ExportSettings) 
     names = Names.read(own) if own.is_file() else Names()
     if asked == "none":
         return names, FoundNames()
-    found = renamed(
-        find_names(skeleton, "xyz".index(up), surface_of_bodies(run, skeleton), templates), settings.name_set
-    )
-    return names.over(found.bodies, found.joints), found
+    found = find_names(skeleton, "xyz".index(up), surface_of_bodies(run, skeleton), templates)
+    known = templates or [read_template(name) for name in built_in_templates()]
+    plain = with_given(found, names.bodies, skeleton, "xyz".index(up), known)
+    # what the user called by a template's word gets the other program's word for it
+    others = {b: n for b, n in names.bodies.items() if plain is found or plain.bodies.get(b) != n}
+    found = renamed(plain, settings.name_set)
+    return Names(others, names.joints, names.source).over(found.bodies, found.joints), found
 
 
 def surface_of_bodies(run: Run, skeleton: Skeleton) -> BodySurface | None:

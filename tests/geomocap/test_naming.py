@@ -2,6 +2,7 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
+import pygltflib
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -17,7 +18,8 @@ from geomocap.export.trc import read_trc
 from geomocap.files.run import Run
 from geomocap.model.skeleton import Skeleton
 from geomocap.naming.best_assignment import heaviest_choices
-from geomocap.naming.found_names import find_names
+from geomocap.naming.found_names import FoundNames, find_names
+from geomocap.naming.given_names import with_given
 from geomocap.naming.name_sets import renamed
 from geomocap.naming.name_templates import NamingError, built_in_templates, read_template
 from geomocap.naming.tree_features import nesting
@@ -178,6 +180,44 @@ def test_the_users_names_go_first_and_none_means_numbers(run, tmp_path):
     assert not (tmp_path / "none" / "names_found.toml").exists()
     with pytest.raises(NamingError, match="snail"):
         export_run(run, ["trc"], ExportSettings(names="snail"))
+
+
+def test_what_the_user_names_by_words_of_a_template_is_known_as_that():
+    skeleton, labels = figure(HUMAN, turn=0.7)
+    given = dict(enumerate(labels))
+    named = with_given(FoundNames(), given, skeleton, 2, (HUMAN, QUADRUPED, BIRD))
+    found = find_names(skeleton, 2)
+    assert named.template is HUMAN and named.sides_known and named.trunk == labels.index("pelvis")
+    assert named.bodies == found.bodies and named.joints == found.joints and named.joint_parts == found.joint_parts
+    assert named.from_world == pytest.approx(found.from_world, abs=0.12)
+    angles = joint_angles(skeleton, named, tuple(skeleton.joint_names))
+    assert {"knee_left_flexion", "elbow_right_flexion", "back_rotation"} <= set(angles.names)
+    rested, _ = at_rest(motion_from_skeleton(skeleton, root=named.trunk), None, named, "T")
+    assert rested.largest_deviation_mm(skeleton.joint_positions) < 1e-6
+    # one who sees that left and right are wrong
+    other = {labels.index("shank_left"): "shank_right", labels.index("shank_right"): "shank_left"}
+    turned = with_given(found, other, skeleton, 2, (HUMAN, QUADRUPED, BIRD))
+    knee = next(j for j, name in found.joints.items() if name == "knee_left")
+    assert turned.joints[knee] == "knee_right" and turned.bodies[labels.index("thigh_left")] == "thigh_left"
+    # words that say nothing of the kind of subject
+    assert with_given(FoundNames(), {0: "head"}, skeleton, 2, (HUMAN, QUADRUPED, BIRD)) == FoundNames()
+    assert with_given(found, {0: "box"}, skeleton, 2, (HUMAN,)) is found
+
+
+def test_names_the_user_gives_reach_angles_and_other_programs_words(tmp_path):
+    skeleton, labels = figure(HUMAN)
+    run = Run(tmp_path / "run")
+    fields = ("joint_positions", "joint_bodies", "joint_names", "body_rotations", "body_positions", "fps")
+    run.write_npz("skeleton.npz", **{name: getattr(skeleton, name) for name in fields})
+    run.write_record({"source": {"up": "z"}})
+    swapped = {"thigh_left": "thigh_right", "thigh_right": "thigh_left"}
+    lines = [f'"{swapped.get(name, name)}" = {b}' for b, name in enumerate(labels) if name != "hand_left"]
+    (run.path / "names.toml").write_text("\n".join([*lines, f'"paw" = {labels.index("hand_left")}']))
+    exported = export_run(run, ["glb"], ExportSettings(name_set="mixamo"))
+    names = [n.name for n in pygltflib.GLTF2.load(str(exported.files["glb"])).nodes]
+    assert names[0] == "mixamorig:Hips" and "paw" in names and "mixamorig:LeftUpLeg" in names
+    assert exported.found.bodies[labels.index("thigh_right")] == "mixamorig:LeftUpLeg"
+    assert exported.angles is not None and "knee_left_flexion" in exported.angles.names
 
 
 def test_the_tree_of_a_person_grows_from_the_pelvis():
