@@ -20,7 +20,7 @@ QUICK = [
     *("--no-pictures", "--workers", "1"),
 ]
 VARIANTS: dict[str, tuple[str, ...]] = {"voxels": (), "cloud": ("--source", "cloud"), "report": ("--pictures",)}
-CHANGING = {"timings.json", "run.toml"}
+CHANGING = {"timings.json", "run.toml", "timings.png", "report.html"}  # with how long it took
 
 
 def make_tiny(folder: Path, variant: str = "voxels") -> Path:
