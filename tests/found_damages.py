@@ -5,6 +5,9 @@ from __future__ import annotations
 FOUND: list[tuple[str, list[tuple[str, float, object]]]] = [
     # NaN that signal: arithmetic with them warns
     ("c3d", [("byte", 0.5, 0), ("over", 0.95703125, b"\xff")]),
+    # headers of arrays that are no syntax
+    ("skeleton.npz", [("byte", 0.130859375, 0)]),
+    ("scan.npz", [("cut", 0.5, None), ("byte", 0.0, 0), ("double", 0.0, 67), ("drop", 0.0, 60)]),
     # a film in a code that libav has no decoder of
     ("video.webm", [("byte", 0.5, 0), ("double", 0.0, 107), ("byte", 0.25, 0)]),
 ]

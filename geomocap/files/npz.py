@@ -118,7 +118,10 @@ def _array(stream: BinaryIO | IO[bytes], length: int) -> np.ndarray:
     read_header = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}.get(version[0])
     if read_header is None:
         raise ValueError(f"array format {version[0]}.{version[1]} isn't known")
-    shape, by_column, kind = read_header(stream)
+    try:
+        shape, by_column, kind = read_header(stream)
+    except Exception:  # it is a piece of Python's syntax, which many parsers of NumPy's stumble over
+        raise ValueError("an array's header can't be read") from None
     if kind.hasobject or kind.kind not in "biufcSU":
         raise ValueError("an array holds no plain numbers or text")
     if any(n < 0 for n in shape):

@@ -78,9 +78,9 @@ def check_ply(path: Path) -> None:
     """
     try:
         with open_plain(path) as file:
-            head, end, _ = file.read(_HEADER_LIMIT).partition(b"end_header")
+            head, end, body = file.read(_HEADER_LIMIT).partition(b"end_header")
             file.seek(len(head) + len(end))
-            kind, elements = _header(head if end else b"")
+            kind, elements = _header(head if body[:1] in (b"\n", b"\r") else b"")
             if kind == "ascii":
                 body = file.read()
                 if strange := body.translate(None, _NUMERIC):
@@ -101,21 +101,28 @@ def check_ply(path: Path) -> None:
 
 
 def _header(head: bytes) -> tuple[str, list[_Element]]:
+    """Read what stands before `end_header`; ValueError for whatever PLY libraries stumble over."""
     first, *lines = head.decode("ascii", "replace").splitlines()
     kind, elements = "", list[_Element]()
     for word, *rest in (line.split() for line in lines if line.strip()):
-        if word == "format":
-            kind = rest[0]
-        elif word == "element":
-            elements.append(_Element(rest[0], int(rest[1])))
-            if elements[-1].count < 0:
+        match word, rest:
+            case (("comment" | "obj_info"), _):
+                pass
+            case "format", [name, "1.0"] if not kind:
+                kind = name
+            case "element", [name, count]:
+                elements.append(_Element(name, int(count)))
+            case "property", ["list", length, item, _]:
+                elements[-1].properties.append((_BYTES[length], _BYTES[item]))
+            case "property", [value, _]:
+                elements[-1].properties.append((_BYTES[value],))
+            case _:
                 raise ValueError
-        elif word == "property":
-            types = rest[1:3] if rest[0] == "list" else rest[:1]
-            elements[-1].properties.append(tuple(_BYTES[t] for t in types))
-    if any(e.count and not e.properties for e in elements):
+    if any(e.count < 0 or (e.count and not e.properties) for e in elements):
         raise ValueError
-    if first.strip() != "ply" or kind not in ("ascii", "binary_little_endian", "binary_big_endian"):
+    if first.rstrip() != "ply" or not head.endswith((b"\n", b"\r")) or any(c < 9 for c in head):
+        raise ValueError
+    if kind not in ("ascii", "binary_little_endian", "binary_big_endian"):
         raise ValueError
     return kind, elements
 

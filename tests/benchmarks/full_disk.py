@@ -56,8 +56,10 @@ def main(number: int = 30, variant: str = "voxels") -> int:
     """Try so many sizes; return how many went wrong."""
     more, bad, places = VARIANTS[variant], 0, Counter[str]()
     with quiet() as told, tempfile.TemporaryDirectory() as folder:
-        capture, whole = make_tiny(Path(folder)), Path(folder) / "whole"
-        run_tiny(capture, whole, *more)
+        capture, whole = make_tiny(Path(folder), variant), Path(folder) / "whole"
+        status, said = run_tiny(capture, whole, *more)
+        if status:
+            raise SystemExit(f"the undisturbed run ends with {status}: {said[-300:]}")
         sizes = limits(whole)
         for n, size in enumerate(sizes[:: max(1, len(sizes) // number)]):
             with small_disk(Path(folder) / f"disk{n}", size) as disk:

@@ -86,7 +86,7 @@ def main(number: int = 100, variant: str = "voxels", seed: int = 0) -> int:
     more, context = VARIANTS[variant], prepared()
     chance, bad, places = random.Random(seed), 0, Counter[str]()
     with quiet() as told, tempfile.TemporaryDirectory() as folder:
-        capture, run = make_tiny(Path(folder)), Path(folder) / "run"
+        capture, run = make_tiny(Path(folder), variant), Path(folder) / "run"
         run_tiny(capture, Path(folder) / "whole", *more)
         whole = digests(Path(folder) / "whole")
         seconds = killed(context, capture, run, 600, *more)
