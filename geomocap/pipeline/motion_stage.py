@@ -79,8 +79,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
 def _best(job: Job, found: dict[str, Motion], geometry: Geometry) -> str:
     """Which motion's model, drawn into the cameras, explains their silhouettes best.
 
-    The first one, of what was measured most directly, stays unless another explains more by what the smallest piece of
-    a surface is: less tells nothing.
+    What is less than the smallest piece that counts as a body of its own is no reason for more bodies.
     """
     if len(found) < 2 or job.capture is None:
         return next(iter(found))
@@ -100,9 +99,9 @@ def _best(job: Job, found: dict[str, Motion], geometry: Geometry) -> str:
         return model_overlap(job.run, capture, model, motion.skeleton)
 
     explained = {source: overlap(source) for source in found}
-    first = next(iter(found))
-    best = max(found, key=explained.__getitem__)
-    return best if explained[best] >= explained[first] + SMALLEST_PIECE else first
+    enough = max(explained.values()) - SMALLEST_PIECE
+    good = [source for source in found if explained[source] > enough]
+    return min(good, key=lambda source: (found[source].body_count, -explained[source]))
 
 
 @dataclass(frozen=True)
