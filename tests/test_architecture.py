@@ -48,6 +48,8 @@ ROOMS: dict[str, set[str]] = {
     "evaluation": VALUES | {"carving", "files", "silhouettes", "export", "skeleton", "subject"},
     "inspection": VALUES | {"files", "export", "evaluation", "subject"},
 }
+# names of version 0.1.0, which are to go
+ROOMS["cameras"] = ROOMS["geometry"] = {"files", "model"}
 ROOMS["config"] = set(ROOMS)
 ROOMS["pipeline"] = set(ROOMS)
 ROOMS["geomocap"] = set(ROOMS)
