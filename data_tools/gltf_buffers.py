@@ -12,8 +12,9 @@ import pygltflib
 
 from data_tools.asset import AssetError
 from geomocap.errors import CaptureError
+from geomocap.files.array_schema import quiet_nan
 from geomocap.files.images import decode_image
-from geomocap.reading import quiet_nan, read_bytes
+from geomocap.reading import read_bytes
 
 COMPONENT_TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 MOST_ELEMENTS = 1 << 26  # of an accessor; vertices of the largest meshes are a tenth of that

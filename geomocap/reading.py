@@ -14,8 +14,6 @@ import tomllib
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numpy as np
-
 from geomocap.errors import GeomocapError, harmless, shortened
 
 __all__ = [
@@ -24,7 +22,6 @@ __all__ = [
     "list_folder",
     "open_plain",
     "parse_toml",
-    "quiet_nan",
     "read_bytes",
     "read_json",
     "read_text",
@@ -133,15 +130,6 @@ def reason(failed: BaseException) -> str:
         return "a number with thousands of digits"
     lines = [line.strip() for line in str(failed).splitlines() if line.strip()]
     return harmless(shortened(lines[0] if lines else type(failed).__name__, 120))
-
-
-def quiet_nan(values: np.ndarray) -> np.ndarray:
-    """Return numbers of a file without signalling NaN, which make arithmetic warn; they are NaN like others then."""
-    if values.dtype.kind != "f" or not (missing := np.isnan(values)).any():
-        return values
-    values = values.copy()
-    values[missing] = np.nan
-    return values
 
 
 def check_name(name: str, where: str, error: type[GeomocapError], what: str = "camera") -> None:

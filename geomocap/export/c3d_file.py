@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from geomocap.export.export_errors import MotionError
-from geomocap.reading import quiet_nan, read_bytes, reason
+from geomocap.files.array_schema import quiet_nan
+from geomocap.reading import read_bytes, reason
 
 _BLOCK = 512
 _KEY = 0x50

@@ -123,3 +123,12 @@ _WORDS = {
     "rotation": "rotations",
     "direction": "directions",
 }
+
+
+def quiet_nan(values: np.ndarray) -> np.ndarray:
+    """Return numbers of a file without signalling NaN, which make arithmetic warn; they are NaN like others then."""
+    if values.dtype.kind != "f" or not (missing := np.isnan(values)).any():
+        return values
+    values = values.copy()
+    values[missing] = np.nan
+    return values

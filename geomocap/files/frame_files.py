@@ -9,12 +9,13 @@ import numpy as np
 import open3d as o3d
 
 from geomocap.errors import GeometryError
+from geomocap.files.array_schema import quiet_nan
 from geomocap.files.atomic import write_atomic
 from geomocap.files.geometry_claims import check_geometry
 from geomocap.files.open3d_geometry import check_ply, read_by_open3d, write_by_open3d
 from geomocap.files.whole_files import is_whole_ply
 from geomocap.model.frame_geometry import BodyPoints, Voxels
-from geomocap.reading import open_plain, quiet_nan, read_bytes
+from geomocap.reading import open_plain, read_bytes
 
 
 def write_voxels(path: Path, voxels: Voxels) -> None:

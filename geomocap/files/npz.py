@@ -16,8 +16,9 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 
 from geomocap.errors import RunError
+from geomocap.files.array_schema import quiet_nan
 from geomocap.files.atomic import write_atomic
-from geomocap.reading import open_plain, quiet_nan, reason
+from geomocap.reading import open_plain, reason
 
 UNPACKED_FREELY = 1 << 28  # bytes; arrays that unpack to no more are never looked at for their packing
 MOST_PACKED = 200  # times; what was measured is packed to a half, truth values to a hundredth
