@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from geomocap.errors import GeometryError
 from geomocap.evaluation.result_check import model_overlap
 from geomocap.model.frame_geometry import Geometry
 from geomocap.model.motion_paths import MotionPaths
@@ -36,10 +37,13 @@ def fit_unseen(job: Job, geometry: Geometry, motion: Motion, paths: MotionPaths)
     def read(frame: int) -> tuple[np.ndarray, np.ndarray | None]:
         return geometry.points(frame), None if features is None else features(frame)
 
-    with job.run.timed("fit") as count:
-        start = joint_motion(model.linkage, found.body_rotations, found.root_positions)
-        followed = fit_motion(model, start, read, geometry.spacing, paths, job.config.following, job.progress)
-        count["items"] = len(geometry)
+    start = joint_motion(model.linkage, found.body_rotations, found.root_positions)
+    try:
+        with job.run.timed("fit") as count:
+            followed = fit_motion(model, start, read, geometry.spacing, paths, job.config.following, job.progress)
+            count["items"] = len(geometry)
+    except GeometryError:  # a frame shows next to nothing of the subject
+        return None
     skeleton = model_skeleton(model, followed.bodies, job.fps)
     before = model_overlap(job.run, job.capture, model, found)
     after = model_overlap(job.run, job.capture, model.reposed(followed.bodies, 0), skeleton)

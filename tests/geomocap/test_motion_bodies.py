@@ -160,13 +160,6 @@ def test_folds_of_cloth_are_no_bodies(three):
     assert same_partition(bodies.label, three.body) > 0.9
 
 
-def test_confidence_of_bodies(found, three):
-    assert found.confidence.shape == (3,)
-    assert (found.confidence > 0.6).all() and (found.confidence <= 1.0).all()
-    forced = find_motion_bodies(MotionPaths(three.positions), MotionBodiesSettings(bodies=4))
-    assert forced.confidence.min() < 0.5
-
-
 def test_misses_of_rings_are_those_of_numpy(three):
     rng = np.random.default_rng(11)
     positions = three.positions[:40] + rng.normal(scale=0.01, size=three.positions[:40].shape)
@@ -374,25 +367,6 @@ def test_completion_carries_gaps_with_the_neighbours(three):
     assert np.median(miss[::5, 6:18]) < 0.01
     assert (certainty[::5, 6:18] < 1).all() and (certainty[::5, 6:18] > 0).all()
     np.testing.assert_array_equal(filled[1::5], three.positions[1::5])
-
-
-@pytest.mark.parametrize(("halved", "bodies"), [(1, 3), (2, 2)])
-def test_a_small_body_is_one_if_others_hang_together_by_it(three, halved, bodies):
-    kept = (three.body != halved) | (np.arange(len(three.body)) % 2 == 0)
-    settings = MotionBodiesSettings(min_fraction=0.22)  # of the samples 2/5, 2/5 and 1/5
-    assert find_motion_bodies(MotionPaths(three.positions[kept]), settings).body_count == bodies
-
-
-def test_what_single_cameras_see_counts_less_in_the_size_of_a_body(three):
-    kept = (three.body != 2) | (np.arange(len(three.body)) % 2 == 0)
-    positions, settings = (
-        three.positions[kept],
-        MotionBodiesSettings(min_fraction=0.16),
-    )  # the last has 1/5 of the samples
-    ray = seen_by_single_cameras(three, 0.0)[1][kept]
-    assert find_motion_bodies(MotionPaths(positions), settings).body_count == 3
-    assert find_motion_bodies(MotionPaths(positions, ray=ray), settings).body_count == 2
-    assert find_motion_bodies(MotionPaths(positions, ray=ray), MotionBodiesSettings()).body_count == 3
 
 
 def test_precision_beyond_what_surfaces_give_hardly_counts():
