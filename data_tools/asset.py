@@ -15,6 +15,8 @@ from geomocap.model.rotations import nearest_rotation
 WORLD_FROM_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 """Turns glTF's axes (Y up, Z towards the viewer) into ours (Z up), (4, 4)."""
 
+_WANDER_PERIODS = (17.0, 10.5 * 5**0.5)  # seconds, along x and y; their ratio is irrational
+
 
 class AssetError(GeomocapError):
     """A file of a subject that can't be read or animated."""
@@ -75,6 +77,8 @@ class AnimatedAsset:
         Displacements of the bind vertices.
     truth_extras : dict of str to array
         What else is known about the subject; goes into truth.npz under these names.
+    wander : float, metres
+        How far the subject's place drifts along x and y while the clip is played in a loop.
     """
 
     name: str
@@ -95,6 +99,7 @@ class AnimatedAsset:
     world_from_asset: np.ndarray = field(default_factory=lambda: np.eye(4))
     morph_targets: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
     truth_extras: dict[str, np.ndarray] = field(default_factory=dict)
+    wander: float = 0.0
 
     def __post_init__(self) -> None:
         V, S, J = len(self.bind_vertices), len(self.slot_joints), len(self.joint_names)
@@ -130,6 +135,11 @@ class AnimatedAsset:
             return time
         return time if 0 <= time <= self.duration else float(time % self.duration)
 
+    def place(self, time: float | None) -> np.ndarray:
+        """How far the subject has drifted, (3,) float, metres, world; it never comes back to where it was."""
+        angles = 2 * np.pi * (time or 0.0) / np.array(_WANDER_PERIODS)
+        return self.wander * np.append(np.sin(angles), 0.0)
+
     def vertices(self, time: float | None) -> np.ndarray:
         """Vertices at a time in seconds (None: rest pose), (V, 3) float, metres, world."""
         pose = self.pose(self.clip_time(time))
@@ -140,7 +150,7 @@ class AnimatedAsset:
         homogeneous = np.column_stack([bound, np.ones(len(bound))])
         # Linear blend skinning: the weighted mean of the slots' matrices moves the vertex
         blended = (self._sparse_weights @ skin[:, :3].reshape(len(skin), 12)).reshape(-1, 3, 4)
-        return np.einsum("vij,vj->vi", blended, homogeneous)
+        return np.einsum("vij,vj->vi", blended, homogeneous) + self.place(time)
 
     def joint_transforms(self, time: float | None) -> tuple[np.ndarray, np.ndarray]:
         """Joints at a time in seconds (None: rest pose).
@@ -152,7 +162,7 @@ class AnimatedAsset:
             World from joint; scale and shear are taken out (the rotation nearest to the transform).
         """
         world = self.world_from_asset @ self.pose(self.clip_time(time)).asset_from_joint
-        return world[:, :3, 3].copy(), nearest_rotation(world[:, :3, :3])
+        return world[:, :3, 3] + self.place(time), nearest_rotation(world[:, :3, :3])
 
     def welded(self, normals: np.ndarray) -> AnimatedAsset:
         """Return the asset with vertices that lie together at rest sharing one normal, unless the file parts them.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +38,9 @@ class SynthesisSettings(Settings):
     fps: float = Field(30.0, ge=LEAST_FPS, le=MOST_FPS, description="frames per second")
     frames: int = Field(60, ge=1, le=999_999, description="number of frames")
     start: float = Field(0.0, ge=0, description="time in the clip at which the capture begins (s)")
+    wander: float = Field(
+        0.0, ge=0, description="how far the subject's place drifts, so that a looped clip never repeats a frame (m)"
+    )
     subject_height: float | None = Field(
         None, gt=0, description="height of the subject at the clip's begin (m); the file's own if not given"
     )
@@ -122,7 +125,7 @@ def synthesize(
     for folder in ("images", "videos"):
         if (capture / folder).exists():
             raise CaptureError(f"{capture}: holds {folder} already; remove it or choose another folder")
-    asset = asset.standing(settings.subject_height)
+    asset = replace(asset.standing(settings.subject_height), wander=settings.wander)
     times = settings.start + np.arange(settings.frames) / settings.fps
     notes = []
     if asset.duration <= 0:
