@@ -13,6 +13,7 @@ from geomocap.dense.dense_settings import CloudSettings
 from geomocap.evaluation.camera_settings import CameraSettings
 from geomocap.export.export_settings import ExportSettings
 from geomocap.files.scan_settings import ScanSettings
+from geomocap.model.windows import WindowSettings
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.segmentation.m3_settings import SegmentationSettings
@@ -32,6 +33,7 @@ class Config(Settings):
     carving: CarvingSettings = Field(CarvingSettings(), description="space carving")
     cloud: CloudSettings = Field(CloudSettings(), description="surface measurement by least squares matching")
     scans: ScanSettings = Field(ScanSettings(), description="reading of scans")
+    windows: WindowSettings = Field(WindowSettings(), description="windows of a long recording")
     segmentation: SegmentationSettings = Field(SegmentationSettings(), description="bodies")
     skeleton: SkeletonSettings = Field(SkeletonSettings(), description="joints and hierarchy")
     tracking: TrackingSettings = Field(TrackingSettings(), description="surface tracking in the images")

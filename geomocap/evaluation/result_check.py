@@ -33,6 +33,7 @@ from geomocap.model.skeleton import Skeleton
 from geomocap.skeleton.kinematics import BodyMotion
 from geomocap.subject.model_mesh import ModelMesh, model_mesh
 from geomocap.subject.subject_model import MODEL_FILE, SubjectModel, read_model
+from geomocap.subject.window_motion import motion_of
 
 FRAMES = 6  # evenly spread
 MESH_TRIANGLES = 20000
@@ -56,7 +57,7 @@ def check_run(run: Run, capture: Capture) -> SelfCheck | None:
         return None
     capture = as_seen(run, capture)
     skeleton, mesh = read_skeleton(run), model_mesh(read_model(run.path / MODEL_FILE), MESH_TRIANGLES)
-    motion = _motion(skeleton)
+    motion = motion_of(skeleton)
     residual = float("nan")
     if (run.path / "diagnostics.npz").exists():
         found = read_diagnostics(run).sample_residuals
@@ -72,16 +73,10 @@ def model_overlap(run: Run, capture: Capture, model: SubjectModel, skeleton: Ske
     It says, without any truth, which of several results for one recording explains the images best.
     """
     capture = as_seen(run, capture)
-    mesh, motion, views = model_mesh(model, MESH_TRIANGLES), _motion(skeleton), _views(run, capture)
+    mesh, motion, views = model_mesh(model, MESH_TRIANGLES), motion_of(skeleton), _views(run, capture)
     rig = capture.rig.undistorted()
     drawn = np.array([_drawn_overlaps(mesh, motion, views(frame), rig, frame) for frame in _looks(motion)])
     return float(np.nanmean(drawn))
-
-
-def _motion(skeleton: Skeleton) -> BodyMotion:
-    start = skeleton.body_positions[0]
-    shifts = skeleton.body_positions - np.einsum("tbij,bj->tbi", skeleton.body_rotations, start)
-    return BodyMotion(skeleton.body_rotations, shifts)
 
 
 def _looks(motion: BodyMotion) -> list[int]:

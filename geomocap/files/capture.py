@@ -304,6 +304,11 @@ class Capture:
         corrected = None if self.corrected is None else self.corrected.select(kept)
         return replace(self, info=info, cameras=kept, sources={c: self.sources[c] for c in kept}, corrected=corrected)
 
+    def part(self, frames: range) -> Capture:
+        """Return the capture with some of the frames that it uses, which are numbered anew."""
+        used = self.first + frames.start, self.first + frames.stop - 1
+        return replace(self, info=self.info.model_copy(update={"frames": used}))
+
     def with_rig(self, rig: Rig) -> Capture:
         """Return the capture with other cameras than those it is calibrated with."""
         return replace(self, corrected=rig)

@@ -9,7 +9,7 @@ import math
 import struct
 import zipfile
 import zlib
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import IO, Any, BinaryIO
 
@@ -39,6 +39,36 @@ def write_npz(path: Path, arrays: dict[str, Any]) -> None:
     def write(temporary: Path) -> None:
         with temporary.open("wb") as file:
             np.savez_compressed(file, **arrays)
+
+    write_atomic(path, write)
+
+
+def write_npz_parts(path: Path, arrays: dict[str, tuple[np.dtype, int | None, Iterable[np.ndarray]]]) -> None:
+    """Write arrays that come in parts, one after the other along their first axis, and are never held as a whole.
+
+    Parameters
+    ----------
+    path : Path
+    arrays : dict of str to (dtype, rows, parts)
+        Type, number of rows of all parts together, and the parts in their order, at least one; None: a single part,
+        as it is.
+
+    Raises
+    ------
+    RunError
+        If the file can't be written.
+    """
+
+    def write(temporary: Path) -> None:
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
+            for name, (kind, rows, parts) in arrays.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                    for k, part in enumerate(parts):
+                        if k == 0:
+                            shape = part.shape if rows is None else (rows, *part.shape[1:])
+                            header = {"descr": np.lib.format.dtype_to_descr(kind), "fortran_order": False}
+                            np.lib.format.write_array_header_1_0(member, {**header, "shape": shape})
+                        member.write(np.ascontiguousarray(part, kind).data.cast("B") if part.size else b"")
 
     write_atomic(path, write)
 

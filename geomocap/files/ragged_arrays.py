@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+MOST_POSITIONS = 20_000_000  # of trajectories times frames that are spread at once; of more every k-th is taken
 MOST_FRAMES = 10_000_000  # four days at 30 per second
 MOST_BYTES = 1 << 35  # of an array that is spread over all frames
 
@@ -31,11 +32,8 @@ def spread_over_frames(
     ValueError
         If a trajectory leaves the frames.
     """
+    check_layout(first, start, frames, len(values))
     lengths = np.diff(first)
-    if first.ndim != 1 or len(first) < 1 or start.shape != lengths.shape or lengths.min(initial=0) < 0:
-        raise ValueError("its trajectories don't stand one after the other")
-    if first[0] != 0 or first[-1] != len(values) or not 0 < frames <= MOST_FRAMES:
-        raise ValueError(f"its trajectories take {first[-1]} rows and {frames} frames, it has {len(values)} rows")
     if len(lengths) * frames * values[:1].nbytes > MOST_BYTES:
         raise ValueError(f"{len(lengths):,} trajectories in {frames:,} frames are more than memory holds")
     who = np.repeat(np.arange(len(lengths)), lengths)
@@ -46,3 +44,48 @@ def spread_over_frames(
     result = np.zeros(shape, values.dtype) if counted else np.full(shape, np.nan, values.dtype)
     result[who, when] = values
     return result
+
+
+def check_layout(first: np.ndarray, start: np.ndarray, frames: int, rows: int) -> None:
+    """Raise ValueError if trajectories can't stand one after the other so; see `spread_over_frames`."""
+    lengths = np.diff(first)
+    if first.ndim != 1 or len(first) < 1 or start.shape != lengths.shape or lengths.min(initial=0) < 0:
+        raise ValueError("its trajectories don't stand one after the other")
+    if first[0] != 0 or first[-1] != rows or not 0 < frames <= MOST_FRAMES:
+        raise ValueError(f"its trajectories take {first[-1]} rows and {frames} frames, it has {rows} rows")
+
+
+def one_after_the_other(values: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Take from each trajectory its frames from start to end: (M, …), which `spread_over_frames` undoes.
+
+    Parameters
+    ----------
+    values : (N, T, …)
+    start, end : (N,) int
+        First and last frame of each; end is before start where there is none.
+    """
+    frames = np.arange(values.shape[1])
+    return values[(frames >= start[:, None]) & (frames <= end[:, None])]
+
+
+def some_of(first: np.ndarray, start: np.ndarray, frames: int, most: int = MOST_POSITIONS) -> np.ndarray:
+    """Which trajectories are read where they and their frames are too many to be spread: every k-th, (K,) int.
+
+    Parameters
+    ----------
+    first : (N + 1,) int
+        Where each begins among the values.
+    start : (N,) int
+    frames : int
+        Number of frames T.
+    most : int
+        Of trajectories times frames.
+    """
+    return np.arange(0, len(start), max(1, -(-len(start) * frames // most)))
+
+
+def rows_of(first: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of some trajectories among the values, (M,) int, and where each begins among these, (K + 1,) int."""
+    lengths = first[which + 1] - first[which]
+    begin = np.concatenate([[0], np.cumsum(lengths)])
+    return np.arange(begin[-1]) + np.repeat(first[which] - begin[:-1], lengths), begin

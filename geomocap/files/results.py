@@ -25,7 +25,7 @@ from geomocap.files.images import read_image
 from geomocap.files.npz import read_npz, write_npz
 from geomocap.files.result_schemas import DIAGNOSTICS_SCHEMA, ELLIPSOIDS_SCHEMA, KEYPOINTS_SCHEMA, SKELETON_SCHEMA
 from geomocap.files.run import Run
-from geomocap.files.tracks_file import TRACKS, read_tracks, read_trajectories, write_tracks
+from geomocap.files.tracks_file import TRACKS, join_tracks, read_tracks, read_trajectories, write_tracks
 from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.ellipsoids import Ellipsoids
 from geomocap.model.hierarchy import parents_first
@@ -45,6 +45,7 @@ __all__ = [
     "TRACKS",
     "WARNINGS",
     "CloudRecord",
+    "join_tracks",
     "ply_count",
     "read_cloud_record",
     "read_diagnostics",

@@ -43,6 +43,7 @@ _OWN = {  # folders of stages, and what is theirs there though no record says so
     "voxels": "[0-9][0-9][0-9][0-9][0-9][0-9].ply",
     "cloud": "[0-9][0-9][0-9][0-9][0-9][0-9].*",
     "bodies": "[0-9][0-9][0-9][0-9][0-9][0-9].ply",
+    "windows": "[0-9][0-9][0-9][0-9][0-9][0-9]/*.*",
     "review": "report.html",
 }
 _RESULTS = (  # as stages call them
@@ -83,7 +84,8 @@ class Run:
         return {"path": self.path}
 
     def __setstate__(self, state: dict) -> None:
-        object.__setattr__(self, "path", state["path"])
+        for name, value in state.items():
+            object.__setattr__(self, name, value)
         object.__setattr__(self, "_timings_lock", threading.Lock())
 
     # --- files ---
@@ -201,7 +203,7 @@ class Run:
     def folders(self) -> list[Path]:
         """Folders of the run that stages write into and that are there."""
         found = [self.path, *(self.path / name for name in (FOLDER, *_OWN))]
-        found += [p for p in (self.path / "silhouettes").glob("*") if p.is_dir()]
+        found += [p for name in ("silhouettes", "windows") for p in (self.path / name).glob("*") if p.is_dir()]
         return [p for p in found if p.is_dir() and not p.is_symlink()]
 
     def _write_files(self, stage: str, record: StageRecord, files: Iterable[Path]) -> None:

@@ -1,15 +1,21 @@
-"""The trajectories of a run, `tracks.npz`, in either layout: all frames of each, or one after the other."""
+"""The trajectories of a run, `tracks.npz`, in either layout: all frames of each, or one after the other ("ragged").
+
+Those of a long recording stand one after the other, each with the frames of its own life, so that the file grows with
+what was measured; so many are never spread over all frames at once: of these every k-th is read.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from geomocap.errors import GeometryError, RunError
 from geomocap.files.array_schema import check_arrays
-from geomocap.files.npz import read_npz, write_npz
-from geomocap.files.ragged_arrays import spread_over_frames
+from geomocap.files.npz import read_npz, write_npz, write_npz_parts
+from geomocap.files.ragged_arrays import check_layout, one_after_the_other, rows_of, some_of, spread_over_frames
 from geomocap.files.result_schemas import TRACKS_SCHEMA
 from geomocap.files.run import Run
 from geomocap.model.trajectories import REASONS, PathDerivatives, Tracks, Trajectories
@@ -18,7 +24,6 @@ from geomocap.reading import reason
 TRACKS = "tracks.npz"
 _OF_TRAJECTORIES = ("sigma", "correlation", "n_views", "ray", "normals", "placed", "end_reason", "begin_reason")
 _OF_MOTION = ("velocities", "accelerations", "velocity_std", "acceleration_std")
-_LAYOUT = ("layout", "first", "start", "end", "n_frames", "sight")
 _BY_FRAME = ("positions", "sigma", "correlation", "n_views", "ray", "sight", *_OF_MOTION)
 _COUNTED = ("n_views", "ray", "sight")  # 0 where nothing was measured, the others NaN
 
@@ -32,6 +37,51 @@ def write_tracks(run: Run, tracks: Tracks) -> None:
     arrays |= {"ray": followed.ray.astype(np.float32), "reasons": list(REASONS)}
     arrays |= {"unfiltered": tracks.unfiltered, "kept": tracks.kept}
     write_npz(run.path / TRACKS, {name: value for name, value in arrays.items() if value is not None})
+
+
+def join_tracks(run: Run, windows: Sequence[Run], frames: Sequence[range], n_frames: int) -> None:
+    """Join the trajectories of a recording's windows into the file of the whole, reading one window at a time.
+
+    Those of frames that two windows share are there twice, as each window followed them.
+
+    Parameters
+    ----------
+    run : Run
+    windows : sequence of Run
+        In which `tracks.npz` of each window is.
+    frames : sequence of range
+        Frames of each window, of those of the recording.
+    n_frames : int
+        Number of the recording's frames.
+    """
+    lives = [_life(read_npz(w.path / TRACKS, ("start", "end"), ("start", "end"))) for w in windows]
+    lengths = [np.maximum(end - start + 1, 0) for start, end in lives]
+    count, rows = sum(map(len, lengths)), int(sum(n.sum() for n in lengths))
+
+    def parts(name: str) -> Iterator[np.ndarray]:
+        for w, part in enumerate(windows):
+            found = read_npz(part.path / TRACKS, (name,), (name,))[name]
+            if name in _BY_FRAME:
+                yield one_after_the_other(found, *lives[w])
+            else:
+                yield found + frames[w].start if name in ("start", "end", "placed") else found
+
+    long, short = np.dtype(np.int64), np.dtype(np.float32)
+    whole = ("n_views", "placed", "start", "end", "end_reason", "begin_reason")
+    by_frame = ("positions", "sigma", "correlation", "n_views", "ray", *_OF_MOTION)
+    arrays: dict[str, tuple[np.dtype, int | None, Iterable[np.ndarray]]] = {}
+    for name in by_frame:
+        arrays[name] = np.dtype(np.int16) if name in whole else short, rows, parts(name)
+    for name in ("start", "end", "placed", "normals", "end_reason", "begin_reason"):
+        arrays[name] = long if name in whole else short, count, parts(name)
+    first = np.concatenate([[0], np.cumsum(np.concatenate(lengths))])
+    given = {"layout": np.array("ragged"), "first": first, "n_frames": np.array(n_frames), "reasons": np.array(REASONS)}
+    arrays |= {name: (value.dtype, None, [value]) for name, value in given.items()}
+    write_npz_parts(run.path / TRACKS, arrays)
+
+
+def _life(found: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    return found["start"], found["end"]
 
 
 def read_trajectories(run: Run) -> Trajectories:
@@ -66,12 +116,14 @@ def read_tracks(run: Run) -> Tracks:
 
 def _arrays(run: Run, names: tuple[str, ...], needed: tuple[str, ...] = ("positions",)) -> dict[str, np.ndarray]:
     """Arrays of those names with the positions, (N, T, …) whatever the layout."""
-    found = read_npz(run.path / TRACKS, ("positions", *_LAYOUT, *names), needed)
-    if str(found.get("layout", "")) == "ragged":
+    file = run.path / TRACKS
+    if str(read_npz(file, ("layout",)).get("layout", "")) == "ragged":
         try:
-            found |= _dense(found)
+            found = _spread(file, ("positions", *names), needed)
         except (KeyError, IndexError, ValueError, TypeError, OverflowError, MemoryError) as error:
             raise _useless(run, error) from None
+    else:
+        found = read_npz(file, ("positions", "sight", *names), needed)
     if "sight" in found:  # as files of older versions call it
         found.setdefault("ray", found["sight"])
     try:
@@ -81,10 +133,22 @@ def _arrays(run: Run, names: tuple[str, ...], needed: tuple[str, ...] = ("positi
     return found
 
 
-def _dense(found: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Give trajectories that stand one after the other all their frames."""
-    layout = found["first"], found["start"], int(found["n_frames"])
-    return {name: spread_over_frames(found[name], *layout, name in _COUNTED) for name in _BY_FRAME if name in found}
+def _spread(file: Path, names: tuple[str, ...], needed: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Give trajectories that stand one after the other all their frames, one array after the other; of many some."""
+    layout = read_npz(file, ("first", "start", "n_frames"), ("first", "start", "n_frames"))
+    first, start, frames = layout["first"], layout["start"], int(layout["n_frames"])
+    found, rows = {}, None
+    for name in (*names, "sight"):
+        values = read_npz(file, (name,), (name,) if name in needed else ()).get(name)
+        if rows is None and values is not None:  # positions
+            check_layout(first, start, frames, len(values))
+            chosen = some_of(first, start, frames)
+            rows, begin = rows_of(first, chosen)
+        if values is not None and name in _BY_FRAME:
+            found[name] = spread_over_frames(values[rows], begin, start[chosen], frames, name in _COUNTED)
+        elif values is not None and name not in ("unfiltered", "kept"):
+            found[name] = values[chosen]
+    return found
 
 
 def _trajectories(run: Run, found: dict[str, np.ndarray]) -> Trajectories:

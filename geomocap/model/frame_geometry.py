@@ -36,6 +36,32 @@ class Geometry(Protocol):
 
 
 @dataclass(frozen=True)
+class GeometryPart:
+    """Some frames of a sequence, numbered from its first."""
+
+    whole: Geometry
+    part: range
+
+    @property
+    def spacing(self) -> float:
+        """Distance of neighbouring points, metres."""
+        return self.whole.spacing
+
+    @property
+    def features(self) -> Callable[[int], np.ndarray] | None:
+        """What else is known of the points, see `Geometry`."""
+        known = self.whole.features
+        return None if known is None else lambda frame: known(self.part[frame])
+
+    def __len__(self) -> int:
+        return len(self.part)
+
+    def points(self, frame: int) -> np.ndarray:
+        """Points of one frame, (N, 3) float, metres, world."""
+        return self.whole.points(self.part[frame])
+
+
+@dataclass(frozen=True)
 class Voxels:
     """Surface voxels of one frame.
 

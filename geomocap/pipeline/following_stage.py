@@ -86,7 +86,7 @@ def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) ->
         joint_axes=posed(model.linkage, followed.bodies, 0).axes,
     )
     write_diagnostics(job.run, made)
-    told = _fit_warnings(model, followed, job.config.following.poor_fit)
+    told = fit_warnings(model, followed, job.config.following.poor_fit)
     write_warnings(job.run, [*camera_warnings(job.run), *told])
     return frames
 
@@ -115,7 +115,8 @@ def model_skeleton(model: SubjectModel, bodies: BodyMotion, fps: float) -> Skele
     return replace(found, joint_names=model.joint_names, body_names=model.body_names)
 
 
-def _fit_warnings(model: SubjectModel, followed: FollowedSequence, poor: float) -> list[str]:
+def fit_warnings(model: SubjectModel, followed: FollowedSequence, poor: float) -> list[str]:
+    """Say in words where a model's surface is farther from that of the sequence than `poor` (diagonals)."""
     fraction = followed.distance / model.diagonal
     if float(np.median(fraction)) > poor:
         return [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 from geomocap.config import Config
 from geomocap.files.capture import Capture
 from geomocap.files.run import Run
+from geomocap.files.run_window import RunWindow
 from geomocap.files.scans import Scans
 from geomocap.files.stage_records import listed_faults
 from geomocap.progress import Progress, silent
@@ -86,6 +87,11 @@ class Job:
                 count["items"] = work()
             self.run.finish(name, optional)
         return key
+
+    def part(self, frames: range) -> Job:
+        """Return the job of some of a capture's frames, in a folder of the run's own for them."""
+        capture = None if self.capture is None else self.capture.part(frames)
+        return replace(self, run=RunWindow.of(self.run, frames), capture=capture)
 
     def write_record(self, *tables: str) -> None:
         """Write `run.toml`: source, settings and versions, enough to repeat the run.

@@ -20,6 +20,7 @@ from geomocap.files.run import Run, stage_key
 from geomocap.files.scan_checks import scan_doubts
 from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.frame_geometry import BodyPoints, Geometry
+from geomocap.model.windows import windows_of
 from geomocap.pipeline.cloud_stage import bounds_of
 from geomocap.pipeline.derived import FROM_BODIES
 from geomocap.pipeline.following_stage import segment_with_model
@@ -27,6 +28,7 @@ from geomocap.pipeline.job import Job
 from geomocap.pipeline.motion_stage import segment_by_motion
 from geomocap.pipeline.sources import Source, geometry_of
 from geomocap.pipeline.track_stage import tracks
+from geomocap.pipeline.window_stage import segment_windows
 from geomocap.scheduling import map_items
 from geomocap.segmentation.m3 import segment_m3
 from geomocap.segmentation.m3_result import Segmentation
@@ -49,8 +51,15 @@ def segment(job: Job, source: Source) -> str:
     outputs, optional = ["ellipsoids.npz", "bodies", "diagnostics.npz"], [MODEL_FILE, WARNINGS]
     # a single frame has no motion to tell bodies and joints by
     (outputs if len(geometry) > 1 else optional).append("skeleton.npz")
-    key = stage_key(__name__, "segmentation", source_key, tracks(job) if has_tracks else None, settings, job.fps)
-    work = partial(segment_by_motion, has_tracks=has_tracks) if by_motion else segment_as_m3
+    windows = windows_of(len(geometry), config.windows) if by_motion and job.capture is not None else []
+    work: Callable[[Job, Geometry], int] = segment_as_m3
+    if by_motion:
+        work = partial(segment_by_motion, has_tracks=has_tracks)
+    if len(windows) > 1:
+        work = partial(segment_windows, windows=windows, has_tracks=has_tracks)
+    key = stage_key(
+        __name__, "segmentation", source_key, tracks(job) if has_tracks else None, settings, job.fps, windows
+    )
     return job.stage(
         "segmentation", key, outputs, lambda: _doubting(job, lambda: work(job, geometry)), optional, FROM_BODIES
     )

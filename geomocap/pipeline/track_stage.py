@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -12,10 +12,12 @@ from geomocap.carving.silhouette_views import Undistortion
 from geomocap.errors import CaptureError
 from geomocap.files.capture import Capture
 from geomocap.files.frame_files import read_points, read_voxels
-from geomocap.files.results import read_silhouette, write_tracks
+from geomocap.files.results import TRACKS, join_tracks, read_silhouette, write_tracks
 from geomocap.files.run import Run, stage_key
+from geomocap.files.run_window import RunWindow
 from geomocap.files.scans import point_spacing
 from geomocap.model.frame_geometry import Voxels
+from geomocap.model.windows import windows_of
 from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.patches.point_tracking import track_points
@@ -25,6 +27,8 @@ from geomocap.pipeline.correction_stage import with_cameras
 from geomocap.pipeline.derived import KEYPOINT_FILES
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.voxel_stage import voxels
+from geomocap.scheduling import map_items
+from geomocap.trajectories.trajectory_settings import FilterSettings, SmoothingSettings
 
 _CLOSED = 1.8  # edge of the voxels of a cloud, as a multiple of its spacing: without holes
 
@@ -44,9 +48,11 @@ def tracks(job: Job) -> str:
     tables = ("tracking", "filters", "smoothing")
     settings = {name: getattr(job.config, name).model_dump() for name in tables}
     surface = voxels(job) if _has_hull(capture) else clouds(job)
-    key = stage_key(__name__, "tracks", surface, pictures, settings, job.fps)
-    job.write_record(*tables)
-    return job.stage("tracks", key, ["tracks.npz"], lambda: _track(job, capture), derived=KEYPOINT_FILES)
+    windows = windows_of(capture.n_frames, job.config.windows)
+    key = stage_key(__name__, "tracks", surface, pictures, settings, job.fps, windows)
+    job.write_record(*tables, "windows")
+    work = partial(_track, job, capture) if len(windows) == 1 else partial(_track_windows, job, capture, windows)
+    return job.stage("tracks", key, [TRACKS], work, derived=KEYPOINT_FILES)
 
 
 def _track(job: Job, capture: Capture) -> int:
@@ -56,10 +62,45 @@ def _track(job: Job, capture: Capture) -> int:
     return capture.n_frames
 
 
-def frame_reader(capture: Capture, run: Run, settings: TrackingSettings) -> Callable[[int], FrameViews]:
+def _track_windows(job: Job, capture: Capture, windows: list[range]) -> int:
+    """Track each window by itself, side by side, and join what was found; windows that are done stay."""
+    files = [job.part(w).run.path / TRACKS for w in windows]
+    sound = job.run.sound("tracks")
+    missing = [k for k, file in enumerate(files) if file not in sound]
+    if missing:
+        reduction = frame_reader(capture, job.run, job.config.tracking).reduction
+        config = job.config
+        tracking = config.tracking.model_copy(update={"reduction": reduction})
+        task = _TrackWindow(capture, job.run, job.fps, tracking, config.filters, config.smoothing)
+        made = map_items(task, [windows[k] for k in missing], job.executor, "track windows", job.progress)
+        for k, _ in zip(missing, made, strict=True):
+            job.run.note("tracks", [files[k]])
+    join_tracks(job.run, [job.part(w).run for w in windows], windows, capture.n_frames)
+    return sum(len(windows[k]) for k in missing)
+
+
+@dataclass(frozen=True)
+class _TrackWindow:
+    """Trajectories of one window, written into its folder."""
+
+    capture: Capture
+    run: Run
+    fps: float
+    tracking: TrackingSettings
+    filters: FilterSettings
+    smoothing: SmoothingSettings
+
+    def __call__(self, window: range) -> None:
+        run = RunWindow.of(self.run, window)
+        read = frame_reader(self.capture.part(window), run, self.tracking)
+        found = track_points(read, len(window), self.fps, self.tracking, self.filters, self.smoothing)
+        write_tracks(run, replace(found, unfiltered=None, kept=None))
+
+
+def frame_reader(capture: Capture, run: Run, settings: TrackingSettings) -> ReadFrame:
     """Return what reads the frames of a run for tracking; the first one tells how far images may be reduced."""
     spacing = None if _has_hull(capture) else _CLOSED * point_spacing(read_points(run.frame_file("cloud", 0)).positions)
-    read = _ReadFrame(capture, run, settings, Undistortion.of(capture.rig), settings.reduction or 1, spacing)
+    read = ReadFrame(capture, run, settings, Undistortion.of(capture.rig), settings.reduction or 1, spacing)
     return read if settings.reduction else replace(read, reduction=image_reduction(read(0), settings))
 
 
@@ -75,7 +116,7 @@ def surface_voxels(points: np.ndarray, size: float) -> Voxels:
 
 
 @dataclass(frozen=True)
-class _ReadFrame:
+class ReadFrame:
     """Images, silhouettes and voxels of a frame as tracking wants them."""
 
     capture: Capture
@@ -86,6 +127,7 @@ class _ReadFrame:
     cloud_spacing: float | None
 
     def __call__(self, frame: int) -> FrameViews:
+        """Read one frame."""
         cameras = self.capture.cameras
         images = self.undistortion.images([self.capture.frame(c, frame) for c in cameras])
         masks = [read_silhouette(self.run, c, frame) for c in cameras]

@@ -65,6 +65,7 @@ def follow_model(
     paths: MotionPaths | None = None,
     settings: FollowingSettings | None = None,
     progress: Progress = silent,
+    known: tuple[int, JointMotion] | None = None,
 ) -> FollowedSequence:
     """Follow a model through a sequence.
 
@@ -82,6 +83,8 @@ def follow_model(
         Points of the surface that were tracked in this sequence; they keep it from sliding.
     settings : FollowingSettings, optional
     progress : Progress
+    known : tuple of int and JointMotion, optional
+        A frame and its pose, from where the model is followed both ways; else it is looked for in some frames.
 
     Raises
     ------
@@ -90,11 +93,13 @@ def follow_model(
     """
     settings = settings or FollowingSettings()
     sequence = _Sequence.of(model, read, frames, spacing, settings)
-    surface, views, scales = sequence.surface, sequence.views, sequence.scales
-    # Where it is
-    asked = np.unique(np.linspace(0, frames, settings.start_frames, endpoint=False).astype(int)).tolist()
-    best, pose = find_pose(model, surface, [views[t] for t in asked], scales, up)
-    first = asked[best]
+    if known is None:
+        asked = np.unique(np.linspace(0, frames, settings.start_frames, endpoint=False).astype(int)).tolist()
+        views = [sequence.views[t] for t in asked]
+        best, pose = find_pose(model, sequence.surface, views, sequence.scales, up)
+        first = asked[best]
+    else:
+        first, pose = known
     progress(_STAGE, 1, frames + 1)
     # Frame by frame, both ways
     pieces: dict[int, JointMotion] = {first: pose}
