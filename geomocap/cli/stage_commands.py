@@ -72,7 +72,7 @@ def cloud(
     tell_clouds(job.run)
 
 
-@with_settings("cameras", "silhouettes", "carving", "tracking", "filters", "smoothing")
+@with_settings("cameras", "silhouettes", "carving", "tracking", "windows", "filters", "smoothing")
 def track(
     capture: CaptureFolder,
     run: RunFolder,
@@ -115,7 +115,9 @@ def segment(
     tell_results(run)
 
 
-@with_settings("cameras", "silhouettes", "carving", "cloud", "tracking", "filters", "smoothing", *BODIES, "export")
+@with_settings(
+    "cameras", "silhouettes", "carving", "cloud", "tracking", "windows", "filters", "smoothing", *BODIES, "export"
+)
 def run(
     capture: CaptureFolder,
     run: RunFolder,

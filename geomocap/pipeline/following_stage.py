@@ -22,12 +22,13 @@ from geomocap.files.results import (
 from geomocap.files.run import Run, stage_key
 from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.ellipsoids import Ellipsoids, fit_ellipsoids
-from geomocap.model.frame_geometry import BodyPoints, Geometry
+from geomocap.model.frame_geometry import BodyPoints, Geometry, GeometryPart
 from geomocap.model.skeleton import Skeleton, bone_fixed_skeleton
 from geomocap.pipeline.derived import FROM_BODIES
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.path_choice import patch_paths, point_paths
 from geomocap.pipeline.track_stage import tracks
+from geomocap.pipeline.window_following import follow_windows, shows_most
 from geomocap.scheduling import map_items
 from geomocap.skeleton.kinematics import BodyMotion, posed, since
 from geomocap.subject.model_following import FollowedSequence, follow_model
@@ -42,6 +43,7 @@ def segment_with_model(job: Job, geometry: Geometry, source_key: str) -> str:
     wanted = job.config.segmentation.paths
     if job.capture is not None and job.capture.has_images and wanted != "nodes":
         patches = tracks(job)
+    windows = job.windows
     key = stage_key(
         __name__,
         "following",
@@ -52,30 +54,22 @@ def segment_with_model(job: Job, geometry: Geometry, source_key: str) -> str:
         job.config.following.model_dump(),
         job.fps,
         job.up,
+        windows,
     )
     outputs = ["ellipsoids.npz", "bodies", "diagnostics.npz", "skeleton.npz", MODEL_FILE]
-    work = partial(_follow, job, geometry, model, patches is not None)
+    work = partial(_follow, job, geometry, model, windows, patches is not None)
     return job.stage("segmentation", key, outputs, work, [WARNINGS], FROM_BODIES)
 
 
-def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) -> int:
+def _follow(job: Job, geometry: Geometry, model: SubjectModel, windows: list[range], patches: bool) -> int:
     frames = len(geometry)
-    features = geometry.features if len(model.colors) else None
-
-    def read(frame: int) -> tuple[np.ndarray, np.ndarray | None]:
-        return geometry.points(frame), None if features is None else features(frame)
-
     with job.run.timed("model") as count:
-        followed = follow_model(
-            model,
-            read,
-            frames,
-            geometry.spacing,
-            job.up_axis,
-            patch_paths(read_trajectories(job.run)) if patches else point_paths(job, geometry),
-            job.config.following,
-            job.progress,
-        )
+        if len(windows) <= 1:
+            followed = _follow_piece(job, geometry, model, patches)
+        else:
+            key = shows_most(job, geometry, windows)
+            start = _follow_piece(job.part(windows[key]), GeometryPart(geometry, windows[key]), model, patches)
+            followed = follow_windows(job, geometry, model, windows, key, start, patches)
         count["items"] = frames
     write_followed(job, geometry, model, followed.bodies)
     made = Diagnostics(
@@ -89,6 +83,18 @@ def _follow(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) ->
     told = fit_warnings(model, followed, job.config.following.poor_fit)
     write_warnings(job.run, [*camera_warnings(job.run), *told])
     return frames
+
+
+def _follow_piece(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) -> FollowedSequence:
+    """Look for a model in a recording, or a window of one, and follow it."""
+    features = geometry.features if len(model.colors) else None
+
+    def read(frame: int) -> tuple[np.ndarray, np.ndarray | None]:
+        return geometry.points(frame), None if features is None else features(frame)
+
+    paths = patch_paths(read_trajectories(job.run)) if patches else point_paths(job, geometry)
+    settings, up = job.config.following, job.up_axis
+    return follow_model(model, read, len(geometry), geometry.spacing, up, paths, settings, job.progress)
 
 
 def write_followed(job: Job, geometry: Geometry, model: SubjectModel, bodies: BodyMotion) -> None:

@@ -16,6 +16,7 @@ from geomocap.files.run import Run
 from geomocap.files.run_window import RunWindow
 from geomocap.files.scans import Scans
 from geomocap.files.stage_records import listed_faults
+from geomocap.model.windows import windows_of
 from geomocap.progress import Progress, silent
 from geomocap.version import __version__
 
@@ -87,6 +88,11 @@ class Job:
                 count["items"] = work()
             self.run.finish(name, optional)
         return key
+
+    @property
+    def windows(self) -> list[range]:
+        """Windows that a capture's frames are worked on in, a single one where it is short; of scans none."""
+        return [] if self.capture is None else windows_of(self.capture.n_frames, self.config.windows)
 
     def part(self, frames: range) -> Job:
         """Return the job of some of a capture's frames, in a folder of the run's own for them."""

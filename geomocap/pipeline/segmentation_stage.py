@@ -20,7 +20,6 @@ from geomocap.files.run import Run, stage_key
 from geomocap.files.scan_checks import scan_doubts
 from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.frame_geometry import BodyPoints, Geometry
-from geomocap.model.windows import windows_of
 from geomocap.pipeline.cloud_stage import bounds_of
 from geomocap.pipeline.derived import FROM_BODIES
 from geomocap.pipeline.following_stage import segment_with_model
@@ -51,7 +50,7 @@ def segment(job: Job, source: Source) -> str:
     outputs, optional = ["ellipsoids.npz", "bodies", "diagnostics.npz"], [MODEL_FILE, WARNINGS]
     # a single frame has no motion to tell bodies and joints by
     (outputs if len(geometry) > 1 else optional).append("skeleton.npz")
-    windows = windows_of(len(geometry), config.windows) if by_motion and job.capture is not None else []
+    windows = job.windows if by_motion else []
     work: Callable[[Job, Geometry], int] = segment_as_m3
     if by_motion:
         work = partial(segment_by_motion, has_tracks=has_tracks)

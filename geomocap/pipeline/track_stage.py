@@ -17,7 +17,6 @@ from geomocap.files.run import Run, stage_key
 from geomocap.files.run_window import RunWindow
 from geomocap.files.scans import point_spacing
 from geomocap.model.frame_geometry import Voxels
-from geomocap.model.windows import windows_of
 from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.patches.point_tracking import track_points
@@ -48,7 +47,7 @@ def tracks(job: Job) -> str:
     tables = ("tracking", "filters", "smoothing")
     settings = {name: getattr(job.config, name).model_dump() for name in tables}
     surface = voxels(job) if _has_hull(capture) else clouds(job)
-    windows = windows_of(capture.n_frames, job.config.windows)
+    windows = job.windows
     key = stage_key(__name__, "tracks", surface, pictures, settings, job.fps, windows)
     job.write_record(*tables, "windows")
     work = partial(_track, job, capture) if len(windows) == 1 else partial(_track_windows, job, capture, windows)

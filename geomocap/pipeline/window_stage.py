@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,27 +16,19 @@ from geomocap.files.results import (
     WARNINGS,
     read_diagnostics,
     read_skeleton,
-    read_trajectories,
     read_warnings,
     write_diagnostics,
     write_warnings,
 )
-from geomocap.files.run import Run
-from geomocap.files.run_window import POSES, RunWindow, read_poses, write_poses
 from geomocap.model.frame_geometry import Geometry, GeometryPart
-from geomocap.model.motion_paths import MotionPaths
 from geomocap.pipeline.following_stage import fit_warnings, write_followed
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.motion_stage import segment_by_motion
-from geomocap.pipeline.path_choice import patch_paths
-from geomocap.scheduling import map_items
-from geomocap.skeleton.kinematics import BodyMotion, JointMotion, posed
-from geomocap.subject.following_settings import FollowingSettings
-from geomocap.subject.model_following import FollowedSequence, follow_model
-from geomocap.subject.subject_model import MODEL_FILE, SubjectModel, read_model
-from geomocap.subject.window_motion import joined_motion, motion_of, pose_of
-
-_LOOKS = 12  # frames of a window whose shapes are compared
+from geomocap.pipeline.window_following import follow_windows, shows_most
+from geomocap.skeleton.kinematics import posed
+from geomocap.subject.model_following import FollowedSequence
+from geomocap.subject.subject_model import MODEL_FILE, read_model
+from geomocap.subject.window_motion import motion_of
 
 
 def segment_windows(job: Job, geometry: Geometry, windows: Sequence[range], has_tracks: bool) -> int:
@@ -47,8 +39,7 @@ def segment_windows(job: Job, geometry: Geometry, windows: Sequence[range], has_
     GeometryError
         If the window's bodies make no model that could be followed.
     """
-    shown = map_items(_Shown(geometry), windows, job.executor, "windows", job.progress)
-    key = int(np.argmax(list(shown)))
+    key = shows_most(job, geometry, windows)
     part = job.part(windows[key])
     sound = job.run.sound("segmentation")
     if not {part.run.path / name for name in (SKELETON, MODEL_FILE, DIAGNOSTICS)} <= sound:
@@ -62,8 +53,8 @@ def segment_windows(job: Job, geometry: Geometry, windows: Sequence[range], has_
         job.run.note("segmentation", [f for name in files if (f := part.run.path / name).is_file()])
     model, found = read_model(part.run.path / MODEL_FILE), read_diagnostics(part.run)
     with job.run.timed("follow") as count:
-        start = motion_of(read_skeleton(part.run))
-        followed = _through_windows(job, geometry, model, windows, key, start, has_tracks)
+        start = FollowedSequence(motion_of(read_skeleton(part.run)), np.zeros(len(windows[key])), 0)
+        followed = follow_windows(job, geometry, model, windows, key, start, has_tracks)
         count["items"] = len(geometry) - len(windows[key])
     bodies = followed.bodies
     write_followed(job, geometry, model, bodies)
@@ -84,95 +75,3 @@ def segment_windows(job: Job, geometry: Geometry, windows: Sequence[range], has_
     if told:
         write_warnings(job.run, list(dict.fromkeys(told)))
     return len(geometry)
-
-
-@dataclass(frozen=True)
-class _Shown:
-    """How much the subject's shape changes within a window, metres: what moves against what shows itself so."""
-
-    geometry: Geometry
-
-    def __call__(self, window: range) -> float:
-        frames = np.unique(np.linspace(window.start, window.stop - 1, _LOOKS).round().astype(int))
-        sizes = [np.sqrt(np.linalg.eigvalsh(np.cov(self.geometry.points(int(t)).T))) for t in frames]
-        return float(np.linalg.norm(np.std(sizes, axis=0)))
-
-
-def _through_windows(
-    job: Job,
-    geometry: Geometry,
-    model: SubjectModel,
-    windows: Sequence[range],
-    key: int,
-    start: BodyMotion,
-    has_tracks: bool,
-) -> FollowedSequence:
-    """Follow a model both ways from the window in which its motion is known."""
-    sound = job.run.sound("segmentation")
-    ways = [list(range(key, len(windows))), list(range(key, -1, -1))]
-    chains = [
-        _Chain(job.run, geometry, model, [windows[k] for k in way], start, job.config.following, has_tracks, sound)
-        for way in ways
-        if len(way) > 1
-    ]
-    for _ in map_items(_follow_chain, chains, job.executor, "follow", job.progress):
-        pass
-    motions, distances = [], []
-    for k, window in enumerate(windows):
-        if k == key:
-            motions.append(start)
-            distances.append(np.zeros(len(window)))
-            continue
-        rotations, translations, distance = read_poses(job.part(window).run)
-        motions.append(BodyMotion(rotations, translations))
-        distances.append(distance)
-    distance = np.zeros(len(geometry))
-    for window, of_window in zip(windows, distances, strict=True):
-        distance[window.start : window.stop] = of_window
-    return FollowedSequence(joined_motion(model.linkage, windows, motions), distance, windows[key].start)
-
-
-@dataclass(frozen=True)
-class _Chain:
-    """Windows through which a model is followed one after the other, from the first, in which it is known."""
-
-    run: Run
-    geometry: Geometry
-    model: SubjectModel
-    windows: list[range]
-    start: BodyMotion
-    settings: FollowingSettings
-    has_tracks: bool
-    sound: set
-
-
-def _follow_chain(chain: _Chain) -> None:
-    before, motion = chain.windows[0], chain.start
-    for window in chain.windows[1:]:
-        run = RunWindow.of(chain.run, window)
-        if run.path / POSES in chain.sound:
-            rotations, translations, _ = read_poses(run)
-            motion = BodyMotion(rotations, translations)
-        else:
-            shared = range(max(before.start, window.start), min(before.stop, window.stop))
-            middle = shared[len(shared) // 2]
-            known = middle - window.start, pose_of(chain.model.linkage, motion, middle - before.start)
-            followed = _follow_window(chain, window, known)
-            motion = followed.bodies
-            file = write_poses(run, motion.rotations, motion.translations, followed.distance)
-            run.note("segmentation", [file])
-        before = window
-
-
-def _follow_window(chain: _Chain, window: range, known: tuple[int, JointMotion]) -> FollowedSequence:
-    geometry = GeometryPart(chain.geometry, window)
-    features = geometry.features if len(chain.model.colors) else None
-
-    def read(frame: int) -> tuple[np.ndarray, np.ndarray | None]:
-        return geometry.points(frame), None if features is None else features(frame)
-
-    paths: MotionPaths | None = None
-    if chain.has_tracks:
-        paths = patch_paths(read_trajectories(RunWindow.of(chain.run, window)))
-    model, spacing = chain.model, geometry.spacing
-    return follow_model(model, read, len(window), spacing, model.up, paths, chain.settings, known=known)
