@@ -15,7 +15,7 @@ from geomocap.cli.reports import capture_of, existing_run, tell_faults, working
 from geomocap.cli.settings_options import with_file_of_options
 from geomocap.errors import GeomocapError
 from geomocap.export.run_export import export_run
-from geomocap.files.results import SKELETON, read_followed
+from geomocap.files.results import SKELETON, read_followed, read_followed_by_frame
 from geomocap.files.run import Run
 from geomocap.keypoints.keypoint_following import Measured
 from geomocap.keypoints.keypoint_regions import KeyPointFile, read_keypoints, write_keypoints
@@ -88,7 +88,9 @@ def edit_keypoints(run: Run, file: Path, host: str, port: int, wait: bool) -> No
         _report(run, wanted, found)
         return f"Saved {', '.join(p.name for p in (file, *found.files))}."
 
-    editor = KeyPointEditor(subject, Follower(Measured.of(tracks)), Session.open(begun), save, host, port)
+    editor = KeyPointEditor(
+        subject, Follower(Measured.of(read_followed_by_frame(run))), Session.open(begun), save, host, port
+    )
     console.print(f"editor: {editor.url} (stop with Ctrl+C)", markup=False)
     try:
         editor.serve()

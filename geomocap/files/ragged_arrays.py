@@ -36,10 +36,7 @@ def spread_over_frames(
     lengths = np.diff(first)
     if len(lengths) * frames * values[:1].nbytes > MOST_BYTES:
         raise ValueError(f"{len(lengths):,} trajectories in {frames:,} frames are more than memory holds")
-    who = np.repeat(np.arange(len(lengths)), lengths)
-    when = start[who] + np.arange(len(who)) - first[:-1][who]
-    if len(who) and not 0 <= when.min() <= when.max() < frames:
-        raise ValueError(f"trajectories begin or end beyond frames 0 to {frames - 1}")
+    who, when = np.repeat(np.arange(len(lengths)), lengths), frames_of(first, start, frames)
     shape = (len(lengths), frames, *values.shape[1:])
     result = np.zeros(shape, values.dtype) if counted else np.full(shape, np.nan, values.dtype)
     result[who, when] = values
@@ -53,6 +50,21 @@ def check_layout(first: np.ndarray, start: np.ndarray, frames: int, rows: int) -
         raise ValueError("its trajectories don't stand one after the other")
     if first[0] != 0 or first[-1] != rows or not 0 < frames <= MOST_FRAMES:
         raise ValueError(f"its trajectories take {first[-1]} rows and {frames} frames, it has {rows} rows")
+
+
+def frames_of(first: np.ndarray, start: np.ndarray, frames: int) -> np.ndarray:
+    """Frame of each row of trajectories that stand one after the other, (M,) int.
+
+    Raises
+    ------
+    ValueError
+        If a trajectory leaves the frames.
+    """
+    lengths = np.diff(first)
+    when = np.arange(first[-1]) + np.repeat(start - first[:-1], lengths)
+    if len(when) and not 0 <= when.min() <= when.max() < frames:
+        raise ValueError(f"trajectories begin or end beyond frames 0 to {frames - 1}")
+    return when
 
 
 def one_after_the_other(values: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:

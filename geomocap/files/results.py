@@ -25,13 +25,13 @@ from geomocap.files.images import read_image
 from geomocap.files.npz import read_npz, write_npz
 from geomocap.files.result_schemas import DIAGNOSTICS_SCHEMA, ELLIPSOIDS_SCHEMA, KEYPOINTS_SCHEMA, SKELETON_SCHEMA
 from geomocap.files.run import Run
-from geomocap.files.tracks_file import TRACKS, join_tracks, read_tracks, read_trajectories, write_tracks
+from geomocap.files.tracks_file import TRACKS, join_tracks, read_by_frame, read_tracks, read_trajectories, write_tracks
 from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.ellipsoids import Ellipsoids
 from geomocap.model.hierarchy import parents_first
 from geomocap.model.keypoint_paths import KeyPointPaths, KeyPoints
 from geomocap.model.skeleton import Skeleton, body_names, joint_names
-from geomocap.model.trajectories import Trajectories
+from geomocap.model.trajectories import TracksByFrame, Trajectories
 from geomocap.reading import read_json, reason
 
 ELLIPSOIDS, SKELETON, KEYPOINTS = "ellipsoids.npz", "skeleton.npz", "keypoints.npz"
@@ -47,10 +47,12 @@ __all__ = [
     "CloudRecord",
     "join_tracks",
     "ply_count",
+    "read_by_frame",
     "read_cloud_record",
     "read_diagnostics",
     "read_ellipsoids",
     "read_followed",
+    "read_followed_by_frame",
     "read_keypoint_paths",
     "read_points",
     "read_silhouette",
@@ -274,20 +276,32 @@ def read_warnings(run: Run) -> list[str]:
 def read_followed(run: Run) -> Trajectories:
     """Read a run's trajectories; those of the surface's nodes if its bodies were found from them.
 
-    That is so where the images had too little texture to follow patches of the surface, and for scans.
+    That is so where the images had too little texture to follow patches of the surface, and for scans. Of very many
+    some are read.
 
     Raises
     ------
     RunError
         If it has neither.
     """
+    nodes = _followed_nodes(run)
+    return read_trajectories(run) if nodes is None else nodes
+
+
+def read_followed_by_frame(run: Run) -> TracksByFrame:
+    """Read what `read_followed` does, frame by frame: all of it, however long the recording is."""
+    nodes = _followed_nodes(run)
+    return read_by_frame(run) if nodes is None else TracksByFrame.of(nodes)
+
+
+def _followed_nodes(run: Run) -> Trajectories | None:
     found = read_diagnostics(run)
     if found.sample_positions is not None and found.paths in ("nodes", "both", "pieces", "points"):
         with _named(run.path / DIAGNOSTICS):
             return Trajectories.of_positions(found.sample_positions)
     if not run.has(TRACKS):
         raise RunError(f"{run.path}: has no {TRACKS}; run `geomocap track CAPTURE {run.path}` or `geomocap run` first")
-    return read_trajectories(run)
+    return None
 
 
 def read_silhouette(run: Run, camera: str, frame: int) -> np.ndarray:

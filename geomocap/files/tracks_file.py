@@ -13,18 +13,26 @@ from typing import Any
 import numpy as np
 
 from geomocap.errors import GeometryError, RunError
-from geomocap.files.array_schema import check_arrays
+from geomocap.files.array_schema import Expected, check_arrays
 from geomocap.files.npz import read_npz, write_npz, write_npz_parts
-from geomocap.files.ragged_arrays import check_layout, one_after_the_other, rows_of, some_of, spread_over_frames
+from geomocap.files.ragged_arrays import (
+    check_layout,
+    frames_of,
+    one_after_the_other,
+    rows_of,
+    some_of,
+    spread_over_frames,
+)
 from geomocap.files.result_schemas import TRACKS_SCHEMA
 from geomocap.files.run import Run
-from geomocap.model.trajectories import REASONS, PathDerivatives, Tracks, Trajectories
+from geomocap.model.trajectories import REASONS, PathDerivatives, Tracks, TracksByFrame, Trajectories
 from geomocap.reading import reason
 
 TRACKS = "tracks.npz"
 _OF_TRAJECTORIES = ("sigma", "correlation", "n_views", "ray", "normals", "placed", "end_reason", "begin_reason")
 _OF_MOTION = ("velocities", "accelerations", "velocity_std", "acceleration_std")
 _BY_FRAME = ("positions", "sigma", "correlation", "n_views", "ray", "sight", *_OF_MOTION)
+_ONE_AFTER_THE_OTHER = {"positions": Expected("M 3", gaps=True), "sigma": Expected("M", gaps=True)}
 _COUNTED = ("n_views", "ray", "sight")  # 0 where nothing was measured, the others NaN
 
 
@@ -95,6 +103,35 @@ def read_trajectories(run: Run) -> Trajectories:
     return _trajectories(run, _arrays(run, _OF_TRAJECTORIES))
 
 
+def read_by_frame(run: Run) -> TracksByFrame:
+    """Read all positions, frame by frame, however many trajectories there are.
+
+    Raises
+    ------
+    RunError
+        If the file is missing, damaged or has no positions.
+    """
+    file = run.path / TRACKS
+    if str(read_npz(file, ("layout",)).get("layout", "")) != "ragged":
+        return TracksByFrame.of(read_trajectories(run))
+    needed = ("first", "start", "n_frames", "positions")
+    found = read_npz(file, (*needed, "sigma"), needed)
+    try:
+        positions, first, start = found["positions"], found["first"], found["start"]
+        frames = int(found["n_frames"])
+        check_layout(first, start, frames, len(positions))
+        sigma = found.get("sigma", np.full(len(positions), np.nan))
+        check_arrays({"positions": positions, "sigma": sigma}, _ONE_AFTER_THE_OTHER)
+        frame = frames_of(first, start, frames)
+    except (GeometryError, IndexError, ValueError, TypeError, OverflowError, MemoryError) as error:
+        raise _useless(run, error) from None
+    rows = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    rows = rows[np.argsort(frame[rows], kind="stable")]
+    who = np.repeat(np.arange(len(start)), np.diff(first))[rows]
+    begin = np.searchsorted(frame[rows], np.arange(frames + 1))
+    return TracksByFrame(who, positions[rows], sigma[rows], begin, len(start))
+
+
 def read_tracks(run: Run) -> Tracks:
     """Read trajectories with their motion, and what they were before the filters, as far as it is there.
 
@@ -146,8 +183,8 @@ def _spread(file: Path, names: tuple[str, ...], needed: tuple[str, ...]) -> dict
             rows, begin = rows_of(first, chosen)
         if values is not None and name in _BY_FRAME:
             found[name] = spread_over_frames(values[rows], begin, start[chosen], frames, name in _COUNTED)
-        elif values is not None and name not in ("unfiltered", "kept"):
-            found[name] = values[chosen]
+        elif values is not None:
+            found[name] = values if name == "unfiltered" else values[chosen]
     return found
 
 

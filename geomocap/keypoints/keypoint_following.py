@@ -17,7 +17,7 @@ import numpy as np
 from geomocap.errors import GeometryError
 from geomocap.model.keypoint_paths import KeyPointPaths
 from geomocap.model.rotations import rigid_motion
-from geomocap.model.trajectories import Trajectories
+from geomocap.model.trajectories import TracksByFrame, Trajectories
 
 REACH = 4.0
 """Radii within which trajectories bridge gaps."""
@@ -37,24 +37,29 @@ class Measured:
 
     Attributes
     ----------
-    places : (T, N, 3) float, metres, world
-    variance : (T, N) float, metres²
+    tracks : TracksByFrame
+    variance : (M,) float, metres²
+        Of each of its positions.
     diagonal : float, metres
         Of the box around a frame's trajectories: the median of all frames.
     """
 
-    places: np.ndarray
+    tracks: TracksByFrame
     variance: np.ndarray
     diagonal: float
 
     @classmethod
-    def of(cls, tracks: Trajectories) -> Measured:
+    def of(cls, tracks: Trajectories | TracksByFrame) -> Measured:
         """Arrange trajectories by frame; unknown precision counts as good."""
-        places = np.ascontiguousarray(tracks.positions.transpose(1, 0, 2))
-        seen = [x[known] for x in places if (known := np.isfinite(x[:, 0])).any()]
+        found = TracksByFrame.of(tracks) if isinstance(tracks, Trajectories) else tracks
+        seen = [x for t in range(found.n_frames) if len(x := found.positions[found.at(t)])]
         diagonal = float(np.median([np.linalg.norm(np.ptp(x, axis=0)) for x in seen])) if seen else 0.0
-        known_variance = np.nan_to_num(np.ascontiguousarray(tracks.sigma.T) ** 2, nan=0.0)
-        return cls(places, known_variance + (_NOISE * diagonal) ** 2, diagonal)
+        return cls(found, np.nan_to_num(found.sigma**2, nan=0.0) + (_NOISE * diagonal) ** 2, diagonal)
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames T."""
+        return self.tracks.n_frames
 
 
 def follow_keypoints(
@@ -76,7 +81,7 @@ def follow_keypoints(
         If the frame doesn't exist or the arrays don't fit.
     """
     measured = tracks if isinstance(tracks, Measured) else Measured.of(tracks)
-    T = len(measured.places)
+    T = measured.n_frames
     centers, radii = np.asarray(centers, float).reshape(-1, 3), np.asarray(radii, float).ravel()
     if not 0 <= frame < T:
         raise GeometryError(f"key-points are placed in frame {frame}, but there are frames 0 to {T - 1}")
@@ -107,26 +112,28 @@ class _Placement:
 
 def _follow(measured: Measured, center: np.ndarray, radius: float, order: range, paths: KeyPointPaths, k: int) -> None:
     """Follow one key-point through the frames of `order`, the first of which it was placed in."""
-    N = measured.places.shape[1]
-    local = np.full((N, 3), np.nan)  # places of trajectories in the key-point's axes
-    joined = np.full(N, np.inf)  # variance of the key-point's place when they joined; infinite for those that haven't
-    misfit = np.zeros(N)  # largest so far, squared
+    tracks = measured.tracks
+    local = np.full((tracks.count, 3), np.nan)  # places of trajectories in the key-point's axes
+    # variance of the key-point's place when they joined; infinite for those that haven't
+    joined = np.full(tracks.count, np.inf)
+    misfit = np.zeros(tracks.count)  # largest so far, squared
     pose = _Placement(np.eye(3), center, 0.0)
     last: tuple[int, _Placement] | None = None
     for t in order:
-        x = measured.places[t]
-        seen = np.isfinite(x[:, 0])
+        there = tracks.at(t)
+        who, x = tracks.who[there], tracks.positions[there].astype(float)
         if last is None:
             paths.std[t, k] = 0.0
         else:
-            known = np.flatnonzero(seen & np.isfinite(joined))
+            here = np.flatnonzero(np.isfinite(joined[who]))
+            known = who[here]
             if not len(known):
                 continue
             a = local[known]
             distance = np.linalg.norm(a, axis=1)
             soft = (_SOFT * distance) ** 2 * (1 + (distance / radius) ** 2)
-            variance = measured.variance[t, known] + joined[known] + _MEMORY * misfit[known] + soft
-            moved, miss = _fit(a, x[known], variance, pose.turn, _STEADY * measured.diagonal)
+            variance = measured.variance[there][here] + joined[known] + _MEMORY * misfit[known] + soft
+            moved, miss = _fit(a, x[here], variance, pose.turn, _STEADY * measured.diagonal)
             if moved.variance > (_LOST * radius) ** 2:
                 continue
             pose = moved
@@ -137,17 +144,28 @@ def _follow(measured: Measured, center: np.ndarray, radius: float, order: range,
             paths.std[t, k] = np.sqrt(pose.variance)
         paths.positions[t, k] = pose.place
         distance = np.linalg.norm(x - pose.place, axis=1)
-        new = np.flatnonzero(seen & (distance <= REACH * radius) & np.isinf(joined))
+        new = np.flatnonzero((distance <= REACH * radius) & np.isinf(joined[who]))
         if last is None:
             inside = int((distance[new] <= radius).sum())
             paths.bridged[t, k] = inside < _LEAST
             paths.n_tracks[t, k] = len(new) if inside < _LEAST else inside
         else:  # who moves alike joins in
-            shift = np.linalg.norm(pose.local(x[new]) - last[1].local(measured.places[last[0], new]), axis=1)
-            new = new[shift < _ALIKE * measured.diagonal]
-        local[new] = pose.local(x[new])
-        joined[new] = pose.variance
+            shift = pose.local(x[new]) - last[1].local(_places(tracks, last[0], who[new]))
+            new = new[np.linalg.norm(shift, axis=1) < _ALIKE * measured.diagonal]
+        local[who[new]] = pose.local(x[new])
+        joined[who[new]] = pose.variance
         last = t, pose
+
+
+def _places(tracks: TracksByFrame, frame: int, who: np.ndarray) -> np.ndarray:
+    """Positions of some points in a frame, (K, 3); NaN of those that it doesn't show."""
+    there = tracks.at(frame)
+    shown = tracks.who[there]
+    found = np.full((len(who), 3), np.nan)
+    at = np.minimum(np.searchsorted(shown, who), len(shown) - 1)
+    has = shown[at] == who if len(shown) else np.zeros(len(who), bool)
+    found[has] = tracks.positions[there][at[has]]
+    return found
 
 
 def _fit(

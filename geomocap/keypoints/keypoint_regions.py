@@ -13,7 +13,7 @@ from geomocap.errors import GeometryError, SettingsError
 from geomocap.files.atomic import write_text
 from geomocap.keypoints.keypoint_following import REACH, Measured, follow_keypoints
 from geomocap.model.keypoint_paths import KeyPointPaths, KeyPoints
-from geomocap.model.trajectories import Trajectories
+from geomocap.model.trajectories import TracksByFrame, Trajectories
 from geomocap.reading import read_toml
 from geomocap.settings import Settings, check_settings
 from geomocap.trajectories.smoothing import smooth_motion
@@ -112,7 +112,7 @@ def follow_regions(measured: Measured, points: tuple[KeyPoint, ...]) -> KeyPoint
     GeometryError
         If there is no such frame.
     """
-    T, K = len(measured.places), len(points)
+    T, K = measured.n_frames, len(points)
     paths = KeyPointPaths(
         np.full((T, K, 3), np.nan), np.zeros((T, K), bool), np.zeros((T, K), int), np.full((T, K), np.nan)
     )
@@ -125,12 +125,12 @@ def follow_regions(measured: Measured, points: tuple[KeyPoint, ...]) -> KeyPoint
     return paths
 
 
-def follow_placed(tracks: Trajectories, file: KeyPointFile, fps: float) -> KeyPoints:
+def follow_placed(tracks: Trajectories | TracksByFrame, file: KeyPointFile, fps: float) -> KeyPoints:
     """Follow key-points through trajectories, with velocities.
 
     Parameters
     ----------
-    tracks : Trajectories
+    tracks : Trajectories or TracksByFrame
     file : KeyPointFile
     fps : float
         Frames per second.

@@ -152,6 +152,46 @@ class Trajectories:
 
 
 @dataclass(frozen=True)
+class TracksByFrame:
+    """N points over T frames, as each frame shows them: what isn't measured takes no memory.
+
+    Attributes
+    ----------
+    who : (M,) int
+        Number of the point of each position; frame after frame, ascending within one.
+    positions : (M, 3) float, metres, world
+    sigma : (M,) float, metres
+        Standard deviation of a coordinate; NaN where not known.
+    begin : (T + 1,) int
+        Where each frame begins among them.
+    count : int
+        Number of points N.
+    """
+
+    who: np.ndarray
+    positions: np.ndarray
+    sigma: np.ndarray
+    begin: np.ndarray
+    count: int
+
+    @classmethod
+    def of(cls, tracks: Trajectories) -> TracksByFrame:
+        """Arrange trajectories by frame."""
+        frame, who = np.nonzero(tracks.measured.T)
+        begin = np.searchsorted(frame, np.arange(tracks.n_frames + 1))
+        return cls(who, tracks.positions[who, frame], tracks.sigma[who, frame], begin, len(tracks))
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames T."""
+        return len(self.begin) - 1
+
+    def at(self, frame: int) -> slice:
+        """Return where the positions of a frame are."""
+        return slice(int(self.begin[frame]), int(self.begin[frame + 1]))
+
+
+@dataclass(frozen=True)
 class PathDerivatives:
     """Smoothed motion of N points over T frames; NaN where too few frames are near.
 

@@ -14,7 +14,7 @@ from geomocap.export.export_errors import MissingPackageError
 from geomocap.export.markers import keypoint_markers
 from geomocap.export.run_export import run_up
 from geomocap.export.trc import write_trc
-from geomocap.files.results import SKELETON, read_followed, read_skeleton, write_keypoint_paths
+from geomocap.files.results import SKELETON, read_followed_by_frame, read_skeleton, write_keypoint_paths
 from geomocap.files.run import Run
 from geomocap.keypoints.keypoint_regions import KeyPointFile, follow_placed
 from geomocap.model.keypoint_paths import KeyPoints
@@ -42,7 +42,7 @@ def keypoints(run: Run, file: KeyPointFile) -> FollowedKeyPoints:
     GeometryError
         If there are no key-points, or one is placed in a frame that isn't there or where no trajectories are.
     """
-    points = follow_placed(read_followed(run), file, run_fps(run))
+    points = follow_placed(read_followed_by_frame(run), file, run_fps(run))
     stored, trc, c3d = write_keypoint_paths(run, points), run.path / "keypoints.trc", run.path / "keypoints.c3d"
     markers = keypoint_markers(points, run_fps(run), run_up(run))
     write_trc(trc, markers)

@@ -148,7 +148,7 @@ def test_tracks_that_stand_one_after_the_other_are_the_same(tmp_path):
             read_trajectories(Run(tmp_path / "broken"))
     del ragged["first"]
     Run(tmp_path / "broken").write_npz("tracks.npz", **ragged)
-    with pytest.raises(RunError, match=r"tracks\.npz: lacks 'first'"):
+    with pytest.raises(RunError, match=r"tracks\.npz: has no array first"):
         read_tracks(Run(tmp_path / "broken"))
 
 

@@ -8,11 +8,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import RunError, SettingsError
-from geomocap.files.results import join_tracks, read_tracks, read_trajectories, write_tracks
+from geomocap.files.results import join_tracks, read_by_frame, read_tracks, read_trajectories, write_tracks
 from geomocap.files.run import Run
 from geomocap.files.run_window import RunWindow, read_poses, write_poses
 from geomocap.model.hierarchy import Hierarchy
-from geomocap.model.trajectories import PathDerivatives, Tracks, Trajectories
+from geomocap.model.trajectories import PathDerivatives, Tracks, TracksByFrame, Trajectories
 from geomocap.model.windows import WindowSettings, windows_of
 from geomocap.settings import load_settings
 from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, body_motion
@@ -69,6 +69,24 @@ def test_tracks_of_windows_are_joined_and_read_as_those_of_the_whole(tmp_path):
         assert np.isnan(outside).all()
         assert_array_equal(found.trajectories.placed[rows], window.start + 1)
     assert found.trajectories.lengths.sum() == sum(t.trajectories.lengths.sum() for t in made)
+
+
+def test_tracks_are_read_frame_by_frame_in_either_layout(tmp_path):
+    whole = Run(tmp_path)
+    windows = windows_of(44, SMALL)
+    parts = [RunWindow.of(whole, w) for w in windows]
+    for part, window in zip(parts, windows, strict=True):
+        write_tracks(part, made_tracks(window.start, len(window)))
+    join_tracks(whole, parts, windows, 44)
+    found, spread = read_by_frame(whole), read_trajectories(whole)
+    expected = TracksByFrame.of(spread)
+    for name in ("who", "positions", "sigma", "begin", "count"):
+        assert_array_equal(getattr(found, name), getattr(expected, name))
+    for t in (0, 17, 43):
+        assert_array_equal(found.who[found.at(t)], np.flatnonzero(spread.measured[:, t]))
+        assert_array_equal(found.positions[found.at(t)], spread.positions[spread.measured[:, t], t])
+    write_tracks(whole, made_tracks(0, 20))
+    assert_allclose(read_by_frame(whole).positions, TracksByFrame.of(read_trajectories(whole)).positions)
 
 
 def test_of_very_many_tracks_some_are_read(tmp_path, monkeypatch):
