@@ -130,11 +130,16 @@ def fit_warnings(model: SubjectModel, followed: FollowedSequence, poor: float) -
             f"{1000 * np.median(followed.distance):.0f} mm apart ({100 * np.median(fraction):.1f} % of its diagonal; "
             f"up to {100 * poor:g} % is usual). Is it the same subject, at the same scale?"
         ]
+    return poor_frames(fraction, poor)
+
+
+def poor_frames(fraction: np.ndarray, poor: float) -> list[str]:
+    """Say in words in which frames a model's surface is farther from the frame's, (T,) diagonals, than `poor`."""
     bad = np.flatnonzero(fraction > poor)
-    if len(bad):
-        listed = ", ".join(str(t) for t in bad[:5]) + (" …" if len(bad) > 5 else "")
-        return [f"The model fits poorly in {len(bad)} of {len(fraction)} frames ({listed}); look at these."]
-    return []
+    if not len(bad):
+        return []
+    listed = ", ".join(str(t) for t in bad[:5]) + (" …" if len(bad) > 5 else "")
+    return [f"The model fits poorly in {len(bad)} of {len(fraction)} frames ({listed}); look at these."]
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from geomocap.files.results import (
     write_warnings,
 )
 from geomocap.model.frame_geometry import Geometry, GeometryPart
-from geomocap.pipeline.following_stage import fit_warnings, write_followed
+from geomocap.pipeline.following_stage import poor_frames, write_followed
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.motion_stage import segment_by_motion
 from geomocap.pipeline.window_following import follow_windows, shows_most
@@ -71,7 +71,7 @@ def segment_windows(job: Job, geometry: Geometry, windows: Sequence[range], has_
     )
     write_diagnostics(job.run, made)
     told = [*camera_warnings(job.run), *read_warnings(part.run)]
-    told += fit_warnings(model, followed, job.config.following.poor_fit)
+    told += poor_frames(followed.distance / model.diagonal, job.config.following.poor_fit)
     if told:
         write_warnings(job.run, list(dict.fromkeys(told)))
     return len(geometry)

@@ -19,14 +19,23 @@ QUICK = [
     *("--carving.resolution", "32", "--refinement.rounds", "0", "--motion_bodies.depth_rounds", "0"),
     *("--no-pictures", "--workers", "1"),
 ]
-VARIANTS: dict[str, tuple[str, ...]] = {"voxels": (), "cloud": ("--source", "cloud"), "report": ("--pictures",)}
+VARIANTS: dict[str, tuple[str, ...]] = {
+    "voxels": (),
+    "cloud": ("--source", "cloud"),
+    "report": ("--pictures",),
+    "windows": ("--windows.frames", "12", "--windows.overlap", "3", "--tracking.n_patches", "150"),
+}
 CHANGING = {"timings.json", "run.toml", "timings.png", "report.html"}  # with how long it took
 
 
 def make_tiny(folder: Path, variant: str = "voxels") -> Path:
-    """Synthesize a capture of three frames: four cameras, 96×72; for clouds, which are matched, twelve of 128×96."""
+    """Synthesize a capture of three frames: four cameras, 96×72; for clouds, which are matched, twelve of 128×96.
+
+    For windows it has 26 frames.
+    """
     cameras, width, height = (12, 128, 96) if variant == "cloud" else (4, 96, 72)
-    settings = SynthesisSettings(cameras=cameras, width=width, height=height, fps=10, frames=3)
+    frames, fps = (26, 30) if variant == "windows" else (3, 10)
+    settings = SynthesisSettings(cameras=cameras, width=width, height=height, fps=fps, frames=frames)
     synthesize(figure(), folder / "capture", folder / "truth", settings)
     return folder / "capture"
 
