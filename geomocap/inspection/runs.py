@@ -16,10 +16,10 @@ from geomocap.files.results import (
     KEYPOINTS,
     SKELETON,
     TRACKS,
+    read_by_frame,
     read_ellipsoids,
     read_keypoint_paths,
     read_skeleton,
-    read_trajectories,
 )
 from geomocap.files.run import Run
 from geomocap.inspection.description import Description, count, shortened
@@ -104,9 +104,10 @@ def _model(run: Run, told: Description) -> None:
 
 
 def _tracks(run: Run, told: Description) -> None:
-    found = read_trajectories(run)
-    length = found.lengths
-    told.fact("tracks", f"{len(found)} points in {found.n_frames} frames, on average {length.mean():.1f} frames long")
+    found = read_by_frame(run)
+    length = np.bincount(found.who, minlength=found.count)
+    average = length.mean() if found.count else 0.0
+    told.fact("tracks", f"{found.count} points in {found.n_frames} frames, on average {average:.1f} frames long")
     if (length == 0).any():
         told.problem(f"{(length == 0).sum()} tracks have no position in any frame")
 
