@@ -1,6 +1,6 @@
 """Ways to damage a file, and what reading it then must give.
 
-`python -m tests.damaged_files SECONDS [READER[,READER…] …]` fuzzes each that long.
+`python -m tests.damaged_files SECONDS [READER[,READER…] …]` fuzzes each for so much processor time.
 """
 
 from __future__ import annotations
@@ -132,9 +132,9 @@ class Fuzzed:
     def answer(self, done: list[tuple[str, float, object]]) -> str | None:
         """What is said of damages, numbers aside; None, and noted, if the reader breaks.
 
-        What takes over half a minute ends the process, which then tells where it was.
+        What takes over a minute ends the process, which then tells where it was.
         """
-        faulthandler.dump_traceback_later(30, exit=True)
+        faulthandler.dump_traceback_later(60, exit=True)
         try:
             return re.sub(r"[-\d.e]+", "0", survives(self.reader, self.file, damaged(self.whole, done)))
         except Exception as error:  # all that is not one clear line is looked for
@@ -172,24 +172,26 @@ class Fuzzed:
 
 
 def fuzz(names: str, seconds: float, start: int = 0) -> int:
-    """Damage the files of readers (commas between) in turns for so long, from a seed on; return how many broke.
+    """Damage the files of readers (commas between) in turns, from a seed on; return how many broke.
+
+    `seconds` are of processor time.
 
     Tells how many files, how many kinds of answers, and the damages to be put into `tests.found_damages`. What takes
     over 2 GB fails.
     """
-    random, end, used = Random(start), time.monotonic() + seconds, time.process_time()
+    random, begun, end = Random(start), time.monotonic(), time.process_time() + seconds
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(), at_most(2 << 30):
         warnings.simplefilter("error")
         fuzzed = {n: Fuzzed.begin(READERS[n], Path(folder) / str(k)) for k, n in enumerate(names.split(","))}
-        while time.monotonic() < end:
+        while time.process_time() < end:
             for one in fuzzed.values():
                 one.go_on(random, 100)
         for name, one in fuzzed.items():
             for done in one.smallest():
                 print(f"BROKEN ({name!r}, {done!r}),", flush=True)  # noqa: T201
             print(f"{name}: {one.count} damaged files, {len(one.said)} answers", flush=True)  # noqa: T201
-    took = time.process_time() - used
-    print(f"{names}: {took:.0f} s of processor time in {seconds:.0f} s, seed {start}", flush=True)  # noqa: T201
+    took = time.monotonic() - begun
+    print(f"{names}: {seconds:.0f} s of processor time in {took:.0f} s, seed {start}", flush=True)  # noqa: T201
     return sum(bool(one.broken) for one in fuzzed.values())
 
 

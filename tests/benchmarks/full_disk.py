@@ -1,4 +1,5 @@
-"""Tiny runs on disks too small for them, then with room: `python -m tests.benchmarks.full_disk [NUMBER [VARIANT]]`.
+"""Tiny runs on disks too small for them, then with room: `python -m tests.benchmarks.full_disk [NUMBER [VARIANT]]`
+(voxels, cloud, or report: with the pictures and the report of review).
 
 The disk becomes full at files spread over the whole run, first to last. Each run must end with one line that says so,
 leave no half file, and end with the same files as an undisturbed one once there is room. Mounting must be allowed.
@@ -16,7 +17,7 @@ from pathlib import Path
 from geomocap.files.atomic import remains
 from geomocap.files.run import Run
 from geomocap.files.stage_records import read_record, stages
-from tests.benchmarks.tiny_run import VARIANTS, digests, make_tiny, quiet, run_tiny
+from tests.benchmarks.tiny_run import VARIANTS, cut, digests, make_tiny, quiet, run_tiny
 from tests.disks import make_larger, small_disk
 
 BLOCK = 4  # kB: a file takes whole ones
@@ -30,6 +31,11 @@ def limits(run: Path) -> list[int]:
     return sorted({BLOCK * max(1, used - 1) for used in accumulate(blocks)})
 
 
+def named(run: Path) -> set[str]:
+    """Name all files of a run."""
+    return {str(p.relative_to(run)) for p in run.rglob("*") if p.is_file()}
+
+
 def judge(whole: Path, capture: Path, disk: Path, more: tuple[str, ...]) -> tuple[str, list[str]]:
     """Run on a disk that is too small, then with room; return where it stopped, and what is wrong."""
     run, right = disk / "run", digests(whole)
@@ -41,6 +47,7 @@ def judge(whole: Path, capture: Path, disk: Path, more: tuple[str, ...]) -> tupl
     if len(lines) != 1 or "No space left on device" not in lines[0] or "Traceback" in told:
         wrong.append(f"says {told[-300:]}")
     wrong += [f"{n}: not whole" for n, d in digests(run).items() if right.get(n) != d]
+    wrong += [f"{n}: cut" for n in cut(run)]
     wrong += [f"{p.name}: temporary" for p in remains(Run(run).folders())]
     stopped = (Run(run).unfinished() or ["before any stage"])[0]
     make_larger(disk, ROOM)
@@ -49,6 +56,8 @@ def judge(whole: Path, capture: Path, disk: Path, more: tuple[str, ...]) -> tupl
         wrong.append(f"with room it ends with {status}: {told[-300:]}")
     found = digests(run)
     wrong += [f"{n}: other content" for n in sorted(right.keys() | found.keys()) if right.get(n) != found.get(n)]
+    wrong += [f"{n}: cut, with room" for n in cut(run)]
+    wrong += [f"{n}: not there" for n in sorted(named(whole) - named(run))]
     return stopped, wrong
 
 
