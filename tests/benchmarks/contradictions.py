@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -105,7 +106,7 @@ def staged(capture: Capture, size: tuple[int, int], cameras: int, masks: Path | 
     sources = {n: Frames(capture.sources[n], size) for n in names}
     plates = {n: cv2.resize(capture.background(n), size, interpolation=cv2.INTER_AREA) for n in names}
     given = None if masks is None else {n: Frames(Masks(masks / n), size) for n in names}
-    result = Staged(capture.path, capture.info, tuple(names), sources, plates, given)
+    result = Staged(capture.path, capture.info, tuple(names), sources, plates=plates, masks=given)
     result.__dict__["rig"] = Rig(tuple(names), tuple(smaller), rig.cam_from_world)
     return result
 
@@ -199,6 +200,7 @@ def main() -> None:
     parser.add_argument("--cameras", type=int, default=4)
     parser.add_argument("--match", default="")
     options = parser.parse_args()
+    verdicts = Counter[str]()
     for path in options.capture:
         base = staged(Capture.open(path), tuple(options.size), options.cameras, options.masks)
         for name, (change, says) in CASES.items():
@@ -211,7 +213,11 @@ def main() -> None:
             lines = [w for w in found.warnings if camera in w]
             fits = any(part in w for w in lines for part in says.split("|")) and bool(says)
             verdict = "named" if fits else "warned" if lines else "wrong" if found.warnings else "silent"
+            if name == "nothing":
+                verdict = "false" if found.warnings else "right"
+            verdicts[verdict] += 1
             print(f"{path.name:12} {name:22} {verdict:7} {seconds:5.1f} s  {'; '.join(found.warnings)}", flush=True)
+    print(f"{options.cameras} cameras, {options.size[0]}×{options.size[1]}: {dict(verdicts)}")
 
 
 if __name__ == "__main__":
