@@ -71,6 +71,8 @@ class AnimatedAsset:
         Time in seconds, 0 at the clip's first key, to `Pose`; None asks for the rest pose.
     duration : float
         Length of the clip, seconds; 0 if nothing moves.
+    key_rate : float
+        Key frames per second of the clip; 0 if it has none.
     world_from_asset : (4, 4) float
         Similarity into the world: metres, z up.
     morph_targets : (M, V, 3) float
@@ -96,6 +98,7 @@ class AnimatedAsset:
     joint_parents: np.ndarray
     pose: Callable[[float | None], Pose]
     duration: float
+    key_rate: float = 0.0
     world_from_asset: np.ndarray = field(default_factory=lambda: np.eye(4))
     morph_targets: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
     truth_extras: dict[str, np.ndarray] = field(default_factory=dict)

@@ -102,6 +102,13 @@ def _channels(buffers: GltfBuffers, animation: pygltflib.Animation | None) -> tu
     return tuple(channels)
 
 
+def _key_rate(channels: list[Channel]) -> float:
+    """Keys per second where they lie most densely, to a thousandth; 0 if there are none."""
+    longest = max((c.times for c in channels), key=len, default=np.zeros(0))
+    step = float(np.median(np.diff(longest))) if len(longest) > 1 else 0.0
+    return round(1 / step, 3) if step > 0 else 0.0
+
+
 @dataclass
 class _Primitive:
     """One primitive on one node, with what moves it."""
@@ -176,6 +183,7 @@ class _Reader:
             joint_parents=np.array([index.get(self._ancestor(n, index), -1) for n in nodes]),
             pose=tree,
             duration=max((float(c.times[-1]) for c in used), default=start) - start,
+            key_rate=_key_rate(used),
             world_from_asset=WORLD_FROM_GLTF,
             morph_targets=morphs,
         )

@@ -10,7 +10,7 @@ import numpy as np
 
 from geomocap.export.export_errors import require
 from geomocap.files.atomic import write_atomic
-from geomocap.model.palette import body_color
+from geomocap.model.palette import body_color, body_colors
 from viz.drawing import webp
 from viz.view_content import Content
 
@@ -75,6 +75,13 @@ def _record(rr: Any, recording: Any, root: str, content: Content) -> None:
             shown = surface.thinned(POINTS)
             points = rr.Points3D(shown.points, colors=shown.colors, radii=0.5 * shown.spacing)
             recording.log(f"{root}/points", points)
+        if content.surface is not None:
+            faces, owner = content.surface.faces, content.surface.owner
+            corners = content.surface.at(frame)[faces].reshape(-1, 3)
+            triangles, shades = np.arange(len(corners)).reshape(-1, 3), np.repeat(body_colors(owner), 3, axis=0)
+            recording.log(f"{root}/surface", rr.Mesh3D(
+                vertex_positions=corners, triangle_indices=triangles, vertex_colors=shades
+            ))  # fmt: skip
         if content.motion is not None:
             colors = [body_color(int(content.motion.bodies[n])) for n, _ in content.bones]
             labels = [content.motion.names[n] for n, _ in content.bones]

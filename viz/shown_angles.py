@@ -34,6 +34,8 @@ def angles_of(results: Results) -> tuple[AngleSet, str] | None:
     sides = "left and right are told" if found.sides_known else "left and right can't be told, so sides are a and b"
     doubtful = ", ".join(n for b, n in found.bodies.items() if found.confidence[b] < 0.9)
     less = f" Less sure: {doubtful}." if doubtful else ""
+    apart = ", ".join(f"{joint} ({body})" for joint, body in found.unparted.items())
+    less += f" No angle, because both parts are in one body: {apart}." if apart else ""
     count = f"{len(found.bodies)} of {skeleton.body_count} bodies"
     return angles, f"Named as {found.template.name}, {count}; {sides}.{less}"
 

@@ -36,6 +36,7 @@ from viz.scene import stage as stage_of_run
 from viz.shown_angles import angle_words, angles_of
 from viz.shown_names import joint_names
 from viz.turntable import motion_of
+from viz.view_shapes import MovingSurface
 from viz.viewpoints import ViewStage, stage_of, up_vector
 from viz.volumes import spacing
 
@@ -67,6 +68,10 @@ class Content:
         Bodies and joints.
     mesh : SkinnedMesh, optional
         The surface that `motion` moves.
+    surface : MovingSurface, optional
+        One that moves by rules of its own.
+    free : set of int
+        Nodes of the motion that hang on nothing: no bone leads to them.
     joint_names : tuple of str
         Of the motion's nodes: what the joint at the origin of each is called.
     markers : Markers, optional
@@ -86,6 +91,8 @@ class Content:
     points: Callable[[int], SceneSurface | None] = field(default=lambda _: None)
     motion: MotionTree | None = None
     mesh: SkinnedMesh | None = None
+    surface: MovingSurface | None = None
+    free: frozenset[int] = frozenset()
     joint_names: tuple[str, ...] = ()
     markers: Markers | None = None
     ellipsoids: Ellipsoids | None = None
@@ -109,15 +116,18 @@ class Content:
         return stage_of([self._any(p) for p in places], places, self.n_frames, up_vector(self.up))
 
     def _any(self, frame: int) -> np.ndarray:
-        """Points (N, 3) of a frame from whatever is there; the cameras' places if nothing else is."""
+        """Points (N, 3) of a frame from whatever is there; if nothing is, cameras and what lies before them."""
         surface = self.points(frame)
         found = [] if surface is None else [surface.points]
+        if self.surface is not None:
+            found.append(self.surface.at(frame))
         if self.motion is not None:
             found.append(self.bone_ends(frame).reshape(-1, 3))
         if self.markers is not None:
             found.append(self.markers.positions[min(frame, len(self.markers.positions) - 1)])
         if not found and self.rig is not None:
-            found.append(self.rig.centers)
+            reach = float(np.ptp(self.rig.centers, axis=0).max()) or 1.0  # one camera, or all in one place
+            found += [self.rig.centers, self.rig.centers + 0.5 * reach * self.rig.cam_from_world[:, 2, :3]]
         points = np.concatenate(found) if found else np.zeros((0, 3))
         return points[np.isfinite(points).all(axis=1)]
 
@@ -171,7 +181,7 @@ class Content:
         """Bones as pairs of nodes: the one that carries it, and the child at its end or -1 for its own tip."""
         motion = self.motion
         assert motion is not None
-        inner = [(int(motion.parents[n]), n) for n in range(1, motion.n_nodes)]
+        inner = [(int(motion.parents[n]), n) for n in range(1, motion.n_nodes) if n not in self.free]
         return inner + [(n, -1) for n in np.flatnonzero(np.isfinite(motion.tips).all(axis=1)).tolist()]
 
     def bone_ends(self, frame: int) -> np.ndarray:
@@ -208,11 +218,10 @@ def open_content(path: Path, capture: Capture | None = None) -> Content:
             return of_capture(Capture.open(path))
         for folder in (path, path / "sparse"):
             if any((folder / f"cameras{ending}").is_file() for ending in (".txt", ".bin")):
-                rig = read_rig(folder)
-                return Content(path.resolve().name, 1, 1.0, "z", rig=rig)
+                return of_rig(path, read_rig(folder))
     elif path.suffix.lower() in ENDINGS:
         if path.suffix.lower() == ".glb":
-            raise InspectionError(f"{path}: GLB files turn in any glTF viewer; give the run or another motion file")
+            raise InspectionError(f"{path}: read it with data_tools.gltf_reader and give it to of_animation")
         if path.suffix.lower() == ".bvh":
             motion = read_bvh(path)
             motion = replace(motion, bodies=np.arange(motion.n_nodes))  # each its colour
@@ -226,6 +235,11 @@ def open_content(path: Path, capture: Capture | None = None) -> Content:
         return _plain(found[np.isfinite(found).all(axis=1)])
 
     return Content(path.resolve().name, len(scans), 25.0, "z", points)
+
+
+def of_rig(path: Path, rig: Rig) -> Content:
+    """Return a calibration: cameras without pictures."""
+    return Content(path.resolve().name, 1, 1.0, "z", rig=rig)
 
 
 def of_run(results: Results) -> Content:
@@ -262,8 +276,8 @@ def of_run(results: Results) -> Content:
     title, fps = results.run.path.resolve().name, results.fps or 25.0
     shells = results.ellipsoids if results.ellipsoids is not None and results.ellipsoids.frame_count == count else None
     return Content(
-        title, count, fps, up, points, motion, mesh, called, markers, shells, _followed(results, count), rig, picture,
-        results,
+        title, count, fps, up, points, motion, mesh, joint_names=called, markers=markers, ellipsoids=shells,
+        followed=_followed(results, count), rig=rig, picture=picture, results=results,
     )  # fmt: skip
 
 

@@ -38,7 +38,7 @@ class ViewPanel:
             self._frame = gui.add_slider("Frame", 0, max(self.n_frames - 1, 1), 1, 0, disabled=still)
             self._play = gui.add_button("Play", icon="player-play", disabled=still)
             self._speed = gui.add_dropdown("Speed", ("1", "0.5", "0.25", "0.1"))
-        bodies, skin = any(c.motion for c in contents), any(c.mesh for c in contents)
+        bodies, skin = any(c.motion for c in contents), any(c.mesh or c.surface for c in contents)
         named = bodies or any(c.markers for c in contents)
         points = any(c.points(0) is not None for c in contents)
         with gui.add_folder("Chosen", visible=named):

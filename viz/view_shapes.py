@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,32 @@ class BodyPiece:
     faces: np.ndarray
     bones: np.ndarray
     weights: np.ndarray
+
+
+@dataclass(frozen=True)
+class MovingSurface:
+    """A surface whose vertices are asked for frame by frame.
+
+    Attributes
+    ----------
+    faces : (F, 3) int
+    owner : (F,) int
+        The node that moves each triangle most.
+    at : callable
+        Frame to vertices (V, 3), metres.
+    """
+
+    faces: np.ndarray
+    owner: np.ndarray
+    at: Callable[[int], np.ndarray]
+
+    def pieces(self) -> list[tuple[int, np.ndarray, np.ndarray]]:
+        """Cut it by its nodes: node, the vertices of its piece (K,) and triangles of these (G, 3)."""
+        found = []
+        for node in np.unique(self.owner).tolist():
+            used, faces = np.unique(self.faces[self.owner == node], return_inverse=True)
+            found.append((node, used, faces.reshape(-1, 3)))
+        return found
 
 
 def body_pieces(mesh: SkinnedMesh, n_nodes: int) -> list[tuple[int, BodyPiece]]:

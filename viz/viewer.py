@@ -139,7 +139,7 @@ class Viewer:
         """Draw what only moves from frame to frame: bodies, joints, names, cameras."""
         scene, stage = self.server.scene, self._stages[k]
         scene.add_frame(f"/{k}", show_axes=False, position=self._offsets[k])
-        made: dict[str, Any] = {"bodies": [], "joints": [], "names": [], "markers": [], "cameras": {}}
+        made: dict[str, Any] = {"bodies": [], "surface": [], "joints": [], "names": [], "markers": [], "cameras": {}}
         thick = 0.011 * stage.diagonal
         if content.motion is not None:
             R, p = content.posture
@@ -157,6 +157,13 @@ class Viewer:
                 )
                 handle.on_click(lambda _, node=node: self.choose(Chosen(k, "body", node)))
                 made["bodies"].append((node, bones, handle))
+            for node, used, faces in content.surface.pieces() if content.surface is not None else []:
+                mesh = scene.add_mesh_simple(
+                    f"/{k}/surface/{node}", np.zeros((len(used), 3)), faces, side="double",
+                    color=body_color(int(content.motion.bodies[node])),
+                )  # fmt: skip
+                mesh.on_click(lambda _, node=node: self.choose(Chosen(k, "body", node)))
+                made["surface"].append((used, mesh))
             for node in range(content.motion.n_nodes):
                 if content.joint_names[node]:
                     ball = scene.add_icosphere(f"/{k}/joints/{node}", 1.3 * thick, color=_JOINT)
@@ -250,6 +257,7 @@ class Viewer:
                 handle.opacity = 0.4 if self.panel.surface == "glass" else None
                 for own, bone in zip(bones, handle.bones, strict=True):
                     bone.wxyz, bone.position = turned[own], p[own]
+            self._surface(content, frame, made["surface"])
             for node, ball in made["joints"]:
                 ball.position, ball.visible = p[node], shows("skeleton")
             ends = content.bone_ends(frame)
@@ -272,6 +280,15 @@ class Viewer:
             frustum.visible = shows("cameras")
             if shows("cameras") and content.picture is not None:
                 frustum.image = content.picture(name, frame, 240)
+
+    def _surface(self, content: Content, frame: int, pieces: list[tuple[np.ndarray, Any]]) -> None:
+        """Put the pieces of a surface that moves by rules of its own where they are in this frame."""
+        shown = content.surface is not None and self.panel.surface != "off"
+        vertices = content.surface.at(frame).astype(np.float32) if content.surface is not None and shown else None
+        for used, mesh in pieces:
+            mesh.visible, mesh.opacity = shown, 0.4 if self.panel.surface == "glass" else None
+            if vertices is not None:
+                mesh.vertices = vertices[used]
 
     def _cloud(self, k: int, surface: SceneSurface | None) -> None:
         name = f"/{k}/points"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -15,11 +16,14 @@ from geomocap.errors import CalibrationError
 from geomocap.model.rig import Rig
 from geomocap.reading import open_plain, parse_toml, read_text
 
+OPENCV_ENDINGS = (".yml", ".yaml", ".xml", ".json")
 Kind = Literal["colmap", "easymocap", "opencv", "qualisys", "pose2sim", "aniposelib"]
+
+_MATRIX = re.compile(rf"\b({'|'.join(MATRIX_KEYS)})\b\"?\s*[:> ]")
 
 
 def detect_format(path: Path) -> Kind:
-    """Recognise the format of a calibration file or folder by its content.
+    """Recognise the format of a calibration file or folder by its content; OpenCV's files stand for their folder.
 
     Pose2Sim's and aniposelib's TOML differ in `fisheye`, which Pose2Sim always writes, and in 3×3 rotations and nested
     tables, which only caliscope has; otherwise they are the same and both readers agree.
@@ -36,7 +40,7 @@ def detect_format(path: Path) -> Kind:
         if (path / "intri.yml").is_file():
             return "easymocap"
         for file in sorted(path.glob("*")):
-            if file.suffix.lower() in (".yml", ".yaml", ".xml", ".json"):
+            if file.suffix.lower() in OPENCV_ENDINGS:
                 head = _beginning(file)
                 if any(key in head for key in MATRIX_KEYS):
                     return "opencv"
@@ -48,6 +52,8 @@ def detect_format(path: Path) -> Kind:
     text = read_text(path, CalibrationError, "give a calibration file")
     if "<calibration" in text and "focalLengthU" in text:
         return "qualisys"
+    if path.suffix.lower() in OPENCV_ENDINGS and _MATRIX.search(text[:4000]):
+        return "opencv"
     if path.suffix.lower() == ".toml":
         tables = [t for t in parse_toml(text, path, CalibrationError).values() if isinstance(t, dict)]
         if any("matrix" in t and "fisheye" in t and _is_vector(t.get("rotation")) for t in tables):
@@ -101,7 +107,7 @@ def read_calibration(
     if kind == "easymocap":
         return read_easymocap(path if path.is_dir() else path.parent, sizes, metres_per_unit)
     if kind == "opencv":
-        return read_opencv(path, metres_per_unit)
+        return read_opencv(path if path.is_dir() else path.parent, metres_per_unit)
     if kind == "qualisys":
         return read_qualisys(path)
     if kind == "pose2sim":

@@ -3,7 +3,9 @@
 Axes are those of the International Society of Biomechanics: X forward, Y up along the body, Z to the right (Wu et al.
 2002, J. Biomech. 35, 543; Wu et al. 2005, J. Biomech. 38, 981). Where those recommendations use bony landmarks that a
 surface doesn't show, the axis is the joint's own: Z of thigh and shank is the knee's axis, Z of upper arm and forearm
-the elbow's. Feet, hands and the head have the axes of their neighbour in the first frame.
+the elbow's. A part whose end has no joint of its own, because its neighbour is in one body with it, points to the
+middle of its surface, as far as the same part of the other side reaches. Feet, hands and the head have the axes of
+their neighbour in the first frame.
 """
 
 from __future__ import annotations
@@ -64,8 +66,11 @@ def anatomical_frames(skeleton: Skeleton, found: FoundNames) -> AnatomicalFrames
         for side in ("left", "right"):
             names = f"{inner}_{side}", f"{outer}_{side}"
             end = {"shank": "foot", "forearm": "hand"}[outer]
-            places = [joints.get(names[0]), joints.get(names[1]), joints.get(f"{end}_{side}")]
-            _limb(skeleton, bodies, axes, names, places, bend, world)
+            other = {"left": "right", "right": "left"}[side]
+            chain = (inner, outer, end)
+            places = [joints.get(f"{part}_{side}") for part in chain]
+            mirrored = [joints.get(f"{part}_{other}") for part in chain]
+            _limb(skeleton, found, bodies, axes, names, places, mirrored, bend, world)
     for part, neighbour in NEIGHBOUR.items():
         for end in ("", "_left", "_right"):
             if part + end in bodies and neighbour + end in axes:
@@ -94,29 +99,47 @@ def _pair(joints: dict[str, np.ndarray], part: str) -> np.ndarray | None:
 
 def _limb(
     skeleton: Skeleton,
+    found: FoundNames,
     bodies: dict[str, int],
     axes: dict[str, np.ndarray],
     names: tuple[str, str],
     places: list[np.ndarray | None],
+    mirrored: list[np.ndarray | None],
     bend: float,
     world: np.ndarray,
 ) -> None:
     """Add the axes of a limb's upper and lower part; both have the axis of the joint between them as Z."""
     start, middle, end = places
     inner, outer = (bodies.get(name) for name in names)
-    rest = skeleton.body_positions[0]
     if middle is None and inner is not None and outer is not None and inner != outer:
         middle = skeleton.joint_positions[0, _last_joint(skeleton, inner, outer)]
     if inner is not None and start is not None:
-        down = (rest[inner] if middle is None or inner == outer else middle) - start
+        whole = middle is None or inner == outer
+        down = (_middle(skeleton, found, inner, start, *mirrored[:2]) if whole else middle) - start
         across = world[:, 2]
         if outer is not None and outer != inner and middle is not None:
-            tip = rest[outer] if end is None else end
+            tip = _middle(skeleton, found, outer, middle, *mirrored[1:]) if end is None else end
             across = _bending_axis(skeleton, inner, outer, down, tip - middle, bend, across)
             axes[names[1]] = axes_of(middle - tip, across, keep="across")
             axes[names[0]] = axes_of(-down, across, keep="across")
         else:
             axes[names[0]] = axes_of(-down, across, keep="long")
+
+
+def _middle(
+    skeleton: Skeleton,
+    found: FoundNames,
+    body: int,
+    joint: np.ndarray,
+    mirrored: np.ndarray | None,
+    mirrored_end: np.ndarray | None,
+) -> np.ndarray:
+    """Middle (3,) of a body's surface in frame 0, no farther from its joint than the same part of the other side."""
+    points = np.zeros((0, 3)) if found.surface is None else found.surface.points[found.surface.bodies == body]
+    if mirrored is not None and mirrored_end is not None:
+        near = np.linalg.norm(points - joint, axis=1) <= np.linalg.norm(mirrored_end - mirrored)
+        points = points[near] if near.any() else points
+    return points.mean(axis=0) if len(points) else skeleton.body_positions[0, body]
 
 
 def _last_joint(skeleton: Skeleton, inner: int, outer: int) -> int:

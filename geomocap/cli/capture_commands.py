@@ -16,7 +16,7 @@ from data_tools.importing_calibrations import Format, convert_calibration, impor
 from data_tools.synthesize import SynthesisSettings
 from data_tools.synthesize import synthesize as synthesize_capture
 from geomocap import pipeline
-from geomocap.cli.arguments import CaptureFolder, Workers
+from geomocap.cli.arguments import CaptureFolder, MetresPerUnit, Workers
 from geomocap.cli.console import console
 from geomocap.cli.execution import executor_for
 from geomocap.cli.jobs import capture_job
@@ -73,9 +73,7 @@ def import_(
     up: Annotated[
         Literal["y", "z"], typer.Option("--up", help="World axis that points up, where SOURCE doesn't say.")
     ] = "z",
-    metres_per_unit: Annotated[
-        float, typer.Option("--metres-per-unit", min=1e-9, help="Metres in a unit of the calibration.")
-    ] = 1.0,
+    metres_per_unit: MetresPerUnit = 1.0,
     size_mismatch: Annotated[
         SizeMismatch, typer.Option("--size-mismatch", help="pose2sim: how images came to another size than calibrated.")
     ] = "auto",
@@ -113,9 +111,7 @@ def convert(
         Path, typer.Argument(metavar="TARGET", help="File to write; folder for OpenCV, EasyMocap, COLMAP.")
     ],
     kind: Annotated[Format, typer.Option("--format", help="Format to write.")],
-    metres_per_unit: Annotated[
-        float, typer.Option("--metres-per-unit", min=1e-9, help="Metres in a unit of the calibration.")
-    ] = 1.0,
+    metres_per_unit: MetresPerUnit = 1.0,
     workers: Workers = None,
 ) -> None:
     """Convert a calibration between the formats of aniposelib, caliscope, Pose2Sim, OpenCV, EasyMocap and COLMAP."""

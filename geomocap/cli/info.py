@@ -8,24 +8,33 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from geomocap.cli.arguments import Workers
+from geomocap.cli.arguments import MetresPerUnit, Workers
 from geomocap.cli.console import console
+from geomocap.cli.foreign_calibrations import foreign_calibration
 from geomocap.cli.settings_options import with_file_of_options
-from geomocap.inspection import describe
+from geomocap.inspection import Description, describe
+from geomocap.inspection.calibrations import describe_rig
 
 
 @with_file_of_options
 def info(
     path: Annotated[
-        Path, typer.Argument(metavar="PATH", help="Capture, run, calibration or truth folder, motion file, or scans.")
+        Path,
+        typer.Argument(metavar="PATH", help="Capture, run, truth, calibration of any tool, motion file, or scans."),
     ],
+    metres_per_unit: MetresPerUnit = 1.0,
     workers: Workers = None,
 ) -> None:
     """Say what a capture, a run, a calibration, a truth, a motion file or scans hold, and what is wrong with them.
 
     The exit status is 1 if something is wrong.
     """
-    told = describe(path)
+    rig = foreign_calibration(path, metres_per_unit)
+    if rig is None:
+        told = describe(path)
+    else:
+        told = Description(path, "calibration")
+        describe_rig(rig, told)
     console.print(f"{told.path}: {told.kind}")
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for what, value in told.facts:

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from geomocap.cli.arguments import Workers
+from geomocap.cli.arguments import MetresPerUnit, Workers
 from geomocap.cli.console import console
+from geomocap.cli.foreign_calibrations import foreign_calibration
 from geomocap.cli.reports import capture_of, existing_run
 from geomocap.cli.settings_options import with_file_of_options
 from geomocap.files.run import Run
+
+if TYPE_CHECKING:
+    from viz.view_content import Content
 
 
 @with_file_of_options
 def view(
     path: Annotated[
-        Path, typer.Argument(metavar="PATH", help="Run, capture, scans, calibration or motion file (BVH, TRC, C3D).")
+        Path,
+        typer.Argument(metavar="PATH", help="Run, capture, scans, calibration, motion file (BVH, TRC, C3D, GLB)."),
     ],
     other: Annotated[
         Path | None, typer.Argument(metavar="OTHER", help="Another one, shown beside it on the same time line.")
@@ -35,6 +40,7 @@ def view(
         Path | None,
         typer.Option("--rerun", metavar="FILE.rrd", help="Write a Rerun recording instead; needs the extra rerun."),
     ] = None,
+    metres_per_unit: MetresPerUnit = 1.0,
     workers: Workers = None,
 ) -> None:
     """Look at a run, capture, scans, calibration or motion file in the browser; needs the extra view.
@@ -47,14 +53,9 @@ def view(
 
         edit_keypoints(existing_run(path), path / "keypoints.toml", host, port, wait=False)
         return
-    from viz.view_content import open_content
     from viz.viewer import Viewer
 
-    contents = [
-        open_content(p, capture_of(Run(p)) if (p / "run.toml").is_file() else None)
-        for p in (path, other)
-        if p is not None
-    ]
+    contents = [_content(p, metres_per_unit) for p in (path, other) if p is not None]
     if rerun is not None:
         from viz.rerun_recording import write_recording
 
@@ -67,3 +68,18 @@ def view(
         viewer.serve()
     except KeyboardInterrupt:
         console.print("stopped")
+
+
+def _content(path: Path, metres_per_unit: float = 1.0) -> Content:
+    """Open whatever is at a path, of this program or another."""
+    from viz.view_animation import of_animation
+    from viz.view_content import of_rig, open_content
+
+    if path.is_file() and path.suffix.lower() in (".glb", ".gltf"):
+        from data_tools.gltf_reader import load_gltf
+
+        return of_animation(path.name, load_gltf(path))
+    rig = foreign_calibration(path, metres_per_unit)
+    if rig is not None:
+        return of_rig(path, rig)
+    return open_content(path, capture_of(Run(path)) if (path / "run.toml").is_file() else None)

@@ -71,6 +71,7 @@ def names_text(found: FoundNames) -> str:
     template = found.template.name if found.template else "none"
     sides = "" if found.sides_known else "; left and right not told: sides are a and b"
     lines = [f"# named as {template}{sides}; copy to names.toml to change them"]
+    lines += [f"# no {joint}: both its parts are in {body}" for joint, body in found.unparted.items()]
     lines += [f'"{name}" = {b}  # {found.confidence[b]:.2f}' for b, name in found.bodies.items()]
     lines += ["", "[joints]"]
     lines += [f'"{name}" = {j}  # {found.joint_confidence[j]:.2f}' for j, name in found.joints.items()]

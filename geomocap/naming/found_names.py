@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -54,6 +54,8 @@ class FoundNames:
         Forward, left and up from the world's axes in the first frame, if the heading is told.
     scores : dict of template's name to log likelihood ratio
         Those that come near the best.
+    surface : BodySurface or None
+        What the bodies looked like in the first frame.
     """
 
     template: NameTemplate | None = None
@@ -66,11 +68,25 @@ class FoundNames:
     sides_known: bool = False
     from_world: np.ndarray | None = None
     scores: dict[str, float] = field(default_factory=dict)
+    surface: BodySurface | None = None
 
     @property
     def whole(self) -> dict[int, str]:
         """Names of the bodies that are not what was cut off from a part, as thigh_left_2."""
         return {b: name for b, name in self.bodies.items() if not name.rsplit("_", 1)[-1].isdigit()}
+
+    @property
+    def unparted(self) -> dict[str, str]:
+        """Joints that were not found because both their parts are in one body, with the name of that body."""
+        template, found = self.template, {}
+        if template is None:
+            return {}
+        seen = set(self.joint_parts.values())
+        for b, name in self.whole.items():
+            for part in self.parts[b]:
+                if part and part not in seen and template.parents[part] in self.parts[b]:
+                    found[_with_side(template.joints[part], template.sides[part], known=self.sides_known)] = name
+        return found
 
     @property
     def trunk(self) -> int | None:
@@ -119,7 +135,7 @@ def find_names(
         or decoy_score(posture, best[0], score - SURE) > score - SURE
     ):
         return FoundNames(scores=scores)
-    return _names(posture, best[0], best[1], scores)
+    return replace(_names(posture, best[0], best[1], scores), surface=surface)
 
 
 def _names(posture: MeanPosture, template: NameTemplate, ways: list[TreeMatch], scores: dict[str, float]) -> FoundNames:

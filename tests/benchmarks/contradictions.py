@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ import cv2
 import numpy as np
 import pycolmap
 
+from geomocap.errors import GeomocapError
 from geomocap.evaluation.camera_check import check_cameras_of
 from geomocap.files.capture import Capture
 from geomocap.files.images import read_image
@@ -105,7 +107,7 @@ def staged(capture: Capture, size: tuple[int, int], cameras: int, masks: Path | 
     sources = {n: Frames(capture.sources[n], size) for n in names}
     plates = {n: cv2.resize(capture.background(n), size, interpolation=cv2.INTER_AREA) for n in names}
     given = None if masks is None else {n: Frames(Masks(masks / n), size) for n in names}
-    result = Staged(capture.path, capture.info, tuple(names), sources, plates, given)
+    result = Staged(capture.path, capture.info, tuple(names), sources, plates=plates, masks=given)
     result.__dict__["rig"] = Rig(tuple(names), tuple(smaller), rig.cam_from_world)
     return result
 
@@ -185,7 +187,7 @@ CASES: dict[str, tuple[Callable[[Staged], Staged], str]] = {
     "mask full": (lambda c: masked(c, lambda m: m * 0 + 255), "takes 100%"),
     "focal length doubled": (lambda c: focal(c, 2.0), "half of the calibrated"),
     "focal length halved": (lambda c: focal(c, 0.5), "twice the calibrated"),
-    "focal length negative": (lambda c: focal(c, -1.0), "across|upside down"),
+    "focal length negative": (lambda c: focal(c, -1.0), "must be positive"),
     "another time": (lambda c: pictured(c, lambda i: i, late=max(1, len(c.sources[c.cameras[0]]) // 6)), "late|early"),
 }
 
@@ -199,19 +201,27 @@ def main() -> None:
     parser.add_argument("--cameras", type=int, default=4)
     parser.add_argument("--match", default="")
     options = parser.parse_args()
+    verdicts = Counter[str]()
     for path in options.capture:
         base = staged(Capture.open(path), tuple(options.size), options.cameras, options.masks)
         for name, (change, says) in CASES.items():
             if ("mask" in name) != (options.masks is not None) or options.match not in name:
                 continue
             start = time.perf_counter()
-            found = check_cameras_of(change(base))
+            try:
+                warnings = list(check_cameras_of(change(base)).warnings)
+            except GeomocapError as error:  # a camera that can't be, refused
+                warnings = [str(error)]
             seconds = time.perf_counter() - start
             camera = base.cameras[WRONG]
-            lines = [w for w in found.warnings if camera in w]
+            lines = [w for w in warnings if camera in w]
             fits = any(part in w for w in lines for part in says.split("|")) and bool(says)
-            verdict = "named" if fits else "warned" if lines else "wrong" if found.warnings else "silent"
-            print(f"{path.name:12} {name:22} {verdict:7} {seconds:5.1f} s  {'; '.join(found.warnings)}", flush=True)
+            verdict = "named" if fits else "warned" if lines else "wrong" if warnings else "silent"
+            if name == "nothing":
+                verdict = "false" if warnings else "right"
+            verdicts[verdict] += 1
+            print(f"{path.name:12} {name:22} {verdict:7} {seconds:5.1f} s  {'; '.join(warnings)}", flush=True)
+    print(f"{options.cameras} cameras, {options.size[0]}×{options.size[1]}: {dict(verdicts)}")
 
 
 if __name__ == "__main__":

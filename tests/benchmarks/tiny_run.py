@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import os
 import sys
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -61,6 +63,28 @@ def digests(run: Path) -> dict[str, str]:
         for p in sorted(run.rglob("*"))
         if p.is_file() and p.name not in CHANGING and ".stages" not in p.parts
     }
+
+
+def cut(run: Path) -> list[str]:
+    """Name the records of when and how long, whose digests say nothing, that are there but not whole."""
+    found = []
+    for path in sorted(p for p in run.rglob("*") if p.name in CHANGING and ".stages" not in p.parts):
+        data = path.read_bytes()
+        try:
+            match path.suffix:
+                case ".json":
+                    whole = bool(json.loads(data))
+                case ".toml":
+                    whole = "source" in tomllib.loads(data.decode())
+                case ".png":
+                    whole = data.endswith(b"IEND\xaeB`\x82")
+                case _:
+                    whole = data.rstrip().endswith(b"</html>")
+        except ValueError:
+            whole = False
+        if not whole:
+            found.append(str(path.relative_to(run)))
+    return found
 
 
 @contextmanager

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -7,11 +9,14 @@ from geomocap.angles.joint_angles import joint_angles, turn_covariances
 from geomocap.export.angle_files import mot_text
 from geomocap.model.rotations import rotation_about
 from geomocap.naming.found_names import FoundNames, find_names
+from geomocap.naming.mean_posture import BodySurface
 from geomocap.naming.name_templates import read_template
 from tests.geomocap.articulated import skeleton_arrays, skeleton_of
 from tests.geomocap.template_figures import figure
 
 HUMAN = read_template("human")
+LABELS = [f"{p}_{s}" if s else p for p, s in zip(HUMAN.parts, HUMAN.sides, strict=True)]
+HAND = {side: LABELS.index(f"hand_{side}") for side in ("left", "right")}
 BENDS = {"hip": ("thigh", -1), "knee": ("shank", 1), "elbow": ("forearm", -1), "shoulder": ("upper_arm", -1)}
 
 
@@ -42,6 +47,31 @@ def test_a_straight_limb_has_no_flexion_and_a_bent_one_that_of_its_joints():
     bend = np.rad2deg(np.arccos(up @ low / np.linalg.norm(up) / np.linalg.norm(low)))
     assert angles.column("knee_left_flexion")[0] == pytest.approx(bend, abs=0.1)
     assert angles.column("knee_right_flexion")[0] == pytest.approx(bend, abs=0.1)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_forearm_that_has_its_hand_in_one_body_points_where_the_other_sides_does(side):
+    skeleton, names = figure(HUMAN, without=[("hand", side)])
+    plain, other = find_names(skeleton, 2), {"left": "right", "right": "left"}[side]
+    assert plain.bodies[names.index(f"forearm_{side}")] == f"forearm_hand_{side}"
+    number = {name: j for j, name in plain.joints.items()}
+    elbow, wrist = (
+        skeleton.joint_positions[0, number[f"{joint}_{other}"]] * [1, -1, 1] for joint in ("elbow", "wrist")
+    )
+    along = (wrist - elbow) / np.linalg.norm(wrist - elbow)
+    bent = rotation_about(1, np.deg2rad(50.0)) @ along  # the hand
+    reach = np.linspace(0, 1, 600)[:, None]
+    ring = 0.03 * np.stack([np.cos(np.arange(600)), np.sin(np.arange(600)), np.zeros(600)], axis=1)
+    arm = [elbow + reach * (wrist - elbow) + ring, wrist + 0.18 * reach * bent + ring]
+    surface = BodySurface(np.concatenate(arm), np.full(1200, names.index(f"forearm_{side}")))
+    joints = tuple(skeleton.joint_names)
+    found = joint_angles(skeleton, replace(plain, surface=surface), joints)
+    true = found.column(f"elbow_{other}_flexion")[0]  # the figure begins in a posture that is the same on both sides
+    assert found.column(f"elbow_{side}_flexion")[0] == pytest.approx(true, abs=1.0)
+    whole = replace(
+        plain, surface=surface, joint_parts={j: p for j, p in plain.joint_parts.items() if p != HAND[other]}
+    )
+    assert abs(joint_angles(skeleton, whole, joints).column(f"elbow_{side}_flexion")[0] - true) > 5
 
 
 def test_all_angles_are_zero_where_the_user_says():

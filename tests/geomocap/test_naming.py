@@ -12,6 +12,7 @@ from geomocap.export.export_errors import MotionError
 from geomocap.export.export_settings import ExportSettings
 from geomocap.export.rest_pose import at_rest
 from geomocap.export.run_export import export_run
+from geomocap.export.run_names import names_text
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.skinned_mesh import bone_mesh
 from geomocap.export.trc import read_trc
@@ -52,6 +53,15 @@ def test_nesting_of_sets():
     sets = np.array([[1, 1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 1, 1, 0]], bool)
     assert nesting(sets, sets)[0].tolist() == [1, 2, 0, 3]
     assert nesting(sets, sets)[1, 0] == 1
+
+
+def test_joints_between_parts_in_one_body_are_told_as_missing():
+    whole = find_names(figure(HUMAN)[0], 2)
+    found = find_names(figure(HUMAN, without=[("shank", "right"), ("hand", "left")])[0], 2)
+    assert whole.unparted == {} and FoundNames().unparted == {}
+    assert found.unparted == {"knee_right": "thigh_shank_right", "wrist_left": "forearm_hand_left"}
+    assert renamed(found, "mixamo").unparted.keys() == found.unparted.keys()
+    assert "# no knee_right: both its parts are in thigh_shank_right\n" in names_text(found)
 
 
 @pytest.mark.parametrize("template", [HUMAN, QUADRUPED, BIRD], ids=lambda t: t.name)
