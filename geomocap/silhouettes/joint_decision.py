@@ -11,7 +11,7 @@ import numpy as np
 from geomocap.errors import CaptureError
 from geomocap.silhouettes.background import BackgroundModel
 from geomocap.silhouettes.colors import count_colors
-from geomocap.silhouettes.evidence import background_misfit, shadow_misfit, smooth_evidence
+from geomocap.silhouettes.evidence import background_misfit, smooth_evidence
 from geomocap.silhouettes.light import light_change
 from geomocap.silhouettes.likelihood import (
     CLASSES,
@@ -29,6 +29,7 @@ from geomocap.silhouettes.likelihood import (
 from geomocap.silhouettes.other_cameras import FINEST, OtherCameras, agreement, depth_of
 from geomocap.silhouettes.outline import refine_outline
 from geomocap.silhouettes.pieces import clean
+from geomocap.silhouettes.shadows import shadow_misfit
 from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 APART = 0.02  # certain background keeps so far away from the silhouette (part of the image's longer side)

@@ -16,10 +16,11 @@ from geomocap.silhouettes.background import (
     model_from_frames,
     model_from_plate,
 )
-from geomocap.silhouettes.evidence import background_misfit, shadow_misfit, smooth_evidence
+from geomocap.silhouettes.evidence import background_misfit, smooth_evidence
 from geomocap.silhouettes.joint_decision import coverage, silhouette
 from geomocap.silhouettes.light import light_change
 from geomocap.silhouettes.region import region_of_box, region_of_points
+from geomocap.silhouettes.shadows import shadow_misfit
 from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 W, H = 320, 240
