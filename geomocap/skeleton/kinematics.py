@@ -51,6 +51,13 @@ class Linkage:
         return len(self.joints) + 1
 
     @property
+    def places(self) -> np.ndarray:
+        """Point of each body at rest that it turns about, (B, 3), metres: the joint it hangs on; the root's origin."""
+        places = np.empty((self.body_count, 3))
+        places[self.hierarchy.root], places[self.hierarchy.joint_bodies[:, 1]] = self.origin, self.joints
+        return places
+
+    @property
     def joint_dof(self) -> np.ndarray:
         """First degree of freedom of each joint and, last, their number D: (J + 1,) int; the root has the first six."""
         return ROOT_DOF + np.concatenate([[0], np.cumsum(np.where(self.hinge, 1, 3))])
@@ -134,9 +141,7 @@ class BodyMotion:
 def body_motion(linkage: Linkage, motion: JointMotion) -> BodyMotion:
     """Motion of all bodies from the joints' (forward kinematics)."""
     tree, children = linkage.hierarchy, linkage.hierarchy.joint_bodies[:, 1]
-    # Every body's origin is its joint
-    places = np.empty((linkage.body_count, 3))
-    places[tree.root], places[children] = linkage.origin, linkage.joints
+    places = linkage.places
     offsets = np.repeat((places - places[np.maximum(tree.parents, 0)])[None], motion.frames, axis=0)
     offsets[:, tree.root] = motion.root
     if motion.slip is not None:

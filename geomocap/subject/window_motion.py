@@ -8,7 +8,7 @@ import numpy as np
 
 from geomocap.model.rotations import nearest_rotation
 from geomocap.model.skeleton import Skeleton
-from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, body_motion, joint_motion
+from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, joint_motion
 
 
 def pose_of(linkage: Linkage, bodies: BodyMotion, frame: int) -> JointMotion:
@@ -29,15 +29,16 @@ def joined_motion(linkage: Linkage, windows: Sequence[range], motions: Sequence[
     Parameters
     ----------
     linkage : Linkage
-        Its joints hold in the result.
+        Whose bodies turn about the joints that they hang on.
     windows : sequence of range
         Frames of each, in order; each shares some with the next only.
     motions : sequence of BodyMotion
         From one rest pose.
     """
     count = windows[-1].stop
+    places = linkage.places
     rotations = np.zeros((count, linkage.body_count, 3, 3))
-    translations = np.zeros((count, linkage.body_count, 3))
+    carried = np.zeros((count, linkage.body_count, 3))
     weight = np.zeros(count)
     for k, (window, motion) in enumerate(zip(windows, motions, strict=True)):
         share = np.ones(len(window))
@@ -49,13 +50,12 @@ def joined_motion(linkage: Linkage, windows: Sequence[range], motions: Sequence[
             share[len(share) - shared :] = np.arange(shared, 0, -1) / (shared + 1)
         frames = slice(window.start, window.stop)
         rotations[frames] += share[:, None, None, None] * motion.rotations
-        translations[frames] += share[:, None, None] * motion.translations
+        moved = np.einsum("tbij,bj->tbi", motion.rotations, places) + motion.translations
+        carried[frames] += share[:, None, None] * moved
         weight[frames] += share
-    # fractions of neighbours add up to one, so that blended places and turns belong together
-    rotations /= weight[:, None, None, None]
-    translations /= weight[:, None, None]
     turned = nearest_rotation(rotations)
-    return body_motion(linkage, _joints(linkage, BodyMotion(turned, translations)))
+    carried /= weight[:, None, None]
+    return BodyMotion(turned, carried - np.einsum("tbij,bj->tbi", turned, places))
 
 
 def _joints(linkage: Linkage, bodies: BodyMotion) -> JointMotion:

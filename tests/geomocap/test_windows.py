@@ -140,6 +140,14 @@ def test_motion_of_windows_that_agree_is_the_motion(moving):
     assert_allclose(joined.translations, motion.translations, atol=1e-12)
 
 
+def test_joints_that_give_stay_as_they_were_found(moving):
+    linkage, motion = moving
+    motion.translations[:, 1, 2] += 0.01 * np.sin(np.arange(44))
+    windows = windows_of(44, SMALL)
+    joined = joined_motion(linkage, windows, [motion.part(slice(w.start, w.stop)) for w in windows])
+    assert_allclose(joined.translations, motion.translations, atol=1e-12)
+
+
 def test_where_windows_disagree_one_goes_over_into_the_other(moving):
     linkage, motion = moving
     windows = windows_of(44, SMALL)
@@ -148,10 +156,10 @@ def test_where_windows_disagree_one_goes_over_into_the_other(moving):
     joined = joined_motion(linkage, windows, shifted)
     height = joined.translations[:, 0, 2]
     assert (np.diff(height) > -1e-12).all() and np.abs(np.diff(height)).max() < 0.01 / SMALL.overlap
-    # joints hold
+    # joints hold to the second order of the windows' difference
     there = linkage.joint_positions(joined)[:, 0]
     carried = np.einsum("tij,j->ti", joined.rotations[:, 1], linkage.joints[0]) + joined.translations[:, 1]
-    assert_allclose(carried, there, atol=1e-12)
+    assert_allclose(carried, there, atol=1e-9)
 
 
 def test_the_pose_of_a_frame_moves_the_bodies_as_they_were(moving):
