@@ -5,7 +5,7 @@ The same fit measures a motion that was found without the model wherever paths d
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.rotations import turn_angles
 from geomocap.progress import Progress, silent
 from geomocap.skeleton.articulated_adjustment import adjust
 from geomocap.skeleton.body_observations import Observations, SkinPoints
@@ -35,6 +36,8 @@ _STAGE = "model"
 _REACH = 3.0  # standard deviations of the surface
 _NOISE = 2e-4  # diagonals
 _PATH_ROUNDS = 2  # the second with what the first has put right
+_HYPOTHESES = 3  # of the motion, followed side by side
+_DISTINCT = np.deg2rad(10.0)  # turn of some body against its parent by which two poses are two hypotheses
 
 
 @dataclass(frozen=True)
@@ -101,13 +104,12 @@ def follow_model(
     else:
         first, pose = known
     progress(_STAGE, 1, frames + 1)
-    # Frame by frame, both ways
+    # Frame by frame, both ways; where paths tell how bodies turn, one hypothesis will do
+    count = _HYPOTHESES if paths is None else 1
     pieces: dict[int, JointMotion] = {first: pose}
     for order in (range(first + 1, frames), range(first - 1, -1, -1)):
-        for t in order:
-            back = 1 if order.step > 0 else -1
-            pieces[t] = sequence.fitted(_carried_on(pieces[t - back], pieces.get(t - 2 * back)), t)
-            progress(_STAGE, len(pieces), frames + 1)
+        for t in _through(sequence, pieces, order, count):
+            progress(_STAGE, 1 + abs(t - first), frames + 1)
     return sequence.fitted_together(pieces, paths, first, progress)
 
 
@@ -210,6 +212,66 @@ class _Sequence:
         distance = np.array([distance_between(p, v) for p, v in zip(posed, self.views, strict=True)])
         progress(_STAGE, frames + 1, frames + 1)
         return FollowedSequence(bodies, distance, first)
+
+
+@dataclass(frozen=True)
+class _Hypothesis:
+    """A motion up to a frame: the pose there, what led to it, and by what all its poses miss their frames."""
+
+    pose: JointMotion
+    before: _Hypothesis | None
+    cost: float
+
+    @property
+    def expected(self) -> JointMotion:
+        """Pose that follows at the same pace."""
+        return _carried_on(self.pose, None if self.before is None else self.before.pose)
+
+
+def _through(sequence: _Sequence, pieces: dict[int, JointMotion], order: range, count: int) -> Iterator[int]:
+    """Fill in the poses of frames in their order, from that of the frame before, and yield each frame that is done.
+
+    Several hypotheses go side by side, and the one that misses all frames least is taken (beam search; of multiple
+    hypotheses in tracking: Reid 1979; of people: Cham, Rehg 1999). A new one begins in each frame with the pose seen
+    before that suits the frame best: so a limb that was lost behind another is found again, and what is found for a
+    moment only, by mistake, is given up.
+    """
+    if not len(order):
+        return
+    start = order[0] - order.step
+    earlier = pieces.get(start - order.step)
+    beam = [_Hypothesis(pieces[start], None if earlier is None else _Hypothesis(earlier, None, 0.0), 0.0)]
+    for t in order:
+        starts = [(h, h.expected) for h in beam]
+        if count > 1:
+            starts.append((beam[0], _seen_pose(sequence, beam[0].expected, t)))
+        fitted = [(h, sequence.fitted(pose, t)) for h, pose in starts]
+        found = [_Hypothesis(pose, h, h.cost + (sequence.misfit(pose, t) if count > 1 else 0.0)) for h, pose in fitted]
+        beam = []
+        for one in sorted(found, key=lambda h: h.cost):
+            if len(beam) < count and all(_differ(one.pose, other.pose) for other in beam):
+                beam.append(one)
+        yield t
+    best: _Hypothesis | None = beam[0]
+    for t in reversed(order):
+        assert best is not None
+        pieces[t], best = best.pose, best.before
+
+
+def _seen_pose(sequence: _Sequence, expected: JointMotion, frame: int) -> JointMotion:
+    """Of the poses that the model was seen in, as the root is turned now, the one that misses a frame least."""
+    root = sequence.model.root
+    poses = []
+    for seen in sequence.model.poses:
+        local = seen[None].copy()
+        local[:, root] = expected.local[:, root]
+        poses.append(JointMotion(local, expected.root))
+    return poses[int(np.argmin([sequence.misfit(pose, frame) for pose in poses]))]
+
+
+def _differ(one: JointMotion, other: JointMotion) -> bool:
+    """Whether some body turns differently."""
+    return bool(turn_angles(np.swapaxes(one.local[0], 1, 2) @ other.local[0]).max() > _DISTINCT)
 
 
 def _view(

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -126,6 +128,26 @@ def test_surfaces_show_a_body_that_no_path_follows(model):
 
     assert errors(body_motion(model.linkage, start)).max() > 20.0
     assert errors(found.bodies).max() < 5.0
+
+
+def test_a_limb_that_was_lost_is_found_again_in_a_pose_seen_before(model, monkeypatch):
+    folded = np.tile(np.eye(3), (1, 3, 1, 1))
+    folded[0, 1] = Rotation.from_rotvec([0.0, -2.6, 0.0]).as_matrix()
+    known = replace(model, poses=np.concatenate([model.poses, folded]))
+    local = np.tile(np.eye(3), (10, 3, 1, 1))
+    local[5:, 1] = folded[0, 1]  # nothing shows how it came there
+    true = body_motion(model.linkage, JointMotion(local, np.tile(model.linkage.origin, (10, 1))))
+    places = true.carry(model.points, model.skin_bodies, model.skin_weights)
+    start = 0, JointMotion(local[:1], model.linkage.origin[None])
+
+    def error() -> float:
+        found = follow_model(known, lambda t: (places[t], None), 10, SPACING, 2, known=start).bodies
+        turns = np.swapaxes(found.rotations[:, 1], 1, 2) @ true.rotations[:, 1]
+        return float(np.rad2deg(turn_angles(turns)[[2, 8]]).max())  # away from where it jumps, which no motion does
+
+    assert error() < 15.0
+    monkeypatch.setattr("geomocap.subject.model_following._HYPOTHESES", 1)
+    assert error() > 25.0
 
 
 def test_hinge_of_the_model_stays_a_hinge(model, tracked):
