@@ -152,7 +152,7 @@ class FrameViews:
         return (allowed != 0).all(axis=1)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _project(P: np.ndarray, points: np.ndarray, pixel: np.ndarray, depth: np.ndarray) -> None:
     """Project points (N, 3) with P (C, 3, 4) into `pixel` (N, C, 2), NaN behind a camera, and `depth` (N, C)."""
     for n in range(len(points)):
@@ -165,7 +165,7 @@ def _project(P: np.ndarray, points: np.ndarray, pixel: np.ndarray, depth: np.nda
                 pixel[n, c, i] = v / w if w > 0 else np.nan
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _look_up(pixel: np.ndarray, images: np.ndarray, values: np.ndarray) -> None:
     """Read images (C, H, W) at the nearest of their pixels into `values` (N, C); NaN outside and where infinite."""
     C, H, W = images.shape
