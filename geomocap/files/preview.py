@@ -8,7 +8,7 @@ pixels (LONGEST) still show limbs as wide as the patches that are followed on th
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 
 from geomocap.files.capture import Capture, FrameSource
-from geomocap.files.videos import Video
 from geomocap.model.rig import Rig, reduction
 
 LEAST_FPS = 12.0  # frames a second that are left
@@ -102,8 +101,7 @@ class PreviewCapture(Capture):
         for name, source in capture.sources.items():
             width, height = source.size
             factor = reduction(width, height, longest)
-            one_by_one = replace(source, kept=1) if isinstance(source, Video) else source
-            sources[name] = PreviewFrames(one_by_one, first, every, (width // factor, height // factor))
+            sources[name] = PreviewFrames(source, first, every, (width // factor, height // factor))
         info = info.model_copy(update=update)
         return cls(capture.path, info, capture.cameras, sources, capture.corrected, capture, every, longest)
 
