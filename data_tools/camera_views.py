@@ -61,7 +61,7 @@ class DistortedView:
         return _rays(self.corners, self.origin, np.asarray(pixels, dtype=np.int64), samples)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _rays(corners: np.ndarray, origin: np.ndarray, pixels: np.ndarray, samples: int) -> np.ndarray:
     width = corners.shape[1] - 1
     rays = np.empty((len(pixels), samples * samples, 6), dtype=np.float32)

@@ -150,7 +150,7 @@ def _cast(
     return _average(hit // samples**2, shaded, len(pixels), samples**2)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _average(owner: np.ndarray, colors: np.ndarray, count: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Fraction of a pixel's rays that hit, and their mean colour."""
     hits = np.zeros(count, dtype=np.float32)

@@ -82,7 +82,7 @@ class Room:
         return xy.reshape(height, width, 2).astype(np.float32)
 
 
-@njit(cache=True, nogil=True, parallel=False)
+@njit(cache=True, nogil=True, error_model="numpy", parallel=False)
 def _render(
     corners: np.ndarray,
     origin: np.ndarray,
@@ -132,7 +132,7 @@ def _render(
     return image
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _floor(p: np.ndarray, seed: int) -> tuple[float, float, float]:
     """Colour of the floor, 0 … 1: tiles of 60 cm, each a little different, with joints and stains."""
     u, v = p[0] / 0.6, p[1] / 0.6
@@ -146,7 +146,7 @@ def _floor(p: np.ndarray, seed: int) -> tuple[float, float, float]:
     return level, 0.97 * level, 0.9 * level
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _wall(p: np.ndarray, axis: int, floor: float, seed: int) -> tuple[float, float, float]:
     """Colour of a wall or the ceiling, 0 … 1: panels of a metre with grain, a darker skirting board."""
     along, up = (p[1] if axis == 0 else p[0]), (p[1] if axis == 2 else p[2] - floor)

@@ -152,7 +152,7 @@ class ShadedSurface:
         )
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _texel(texels: np.ndarray, first: int, height: int, width: int, u: float, v: float, k: int) -> float:
     """Bilinear look-up with repetition; texel centres at half coordinates."""
     x, y = u * width - 0.5, v * height - 0.5
@@ -165,7 +165,7 @@ def _texel(texels: np.ndarray, first: int, height: int, width: int, u: float, v:
     return (1 - b) * upper + b * lower
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _shade(
     triangles: np.ndarray,
     uvs: np.ndarray,

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _lattice(x: int, y: int, z: int, seed: int) -> int:
     h = (x * 374761393 + y * 668265263 + z * 2147483647 + seed * 1274126177) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
@@ -14,7 +14,7 @@ def _lattice(x: int, y: int, z: int, seed: int) -> int:
     return h ^ (h >> 15)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _slope(h: int, x: float, y: float, z: float) -> float:
     """Dot product with one of the twelve directions to the edges of a cube (Perlin 2002)."""
     k = h & 15
@@ -23,7 +23,7 @@ def _slope(h: int, x: float, y: float, z: float) -> float:
     return (u if (h & 1) == 0 else -u) + (v if (h & 2) == 0 else -v)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def gradient_noise(x: float, y: float, z: float, seed: int) -> float:
     """Perlin's improved gradient noise with cells of size 1, about -1 … 1, mean 0, standard deviation about 0.27.
 
@@ -46,7 +46,7 @@ def gradient_noise(x: float, y: float, z: float, seed: int) -> float:
     return total
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def fabric_noise(x: float, y: float, z: float, cells: np.ndarray, weights: np.ndarray, seed: int) -> float:
     """Sum of octaves of gradient noise; `cells` are their cell sizes in the unit of the position."""
     total = 0.0

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import TypeVar
 
 import cv2
@@ -18,6 +19,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+_PARTS = 8  # of a kernel's work for each thread, which takes the next one when it is ready
 MOST_WORKERS = max(256, 4 * (os.cpu_count() or 1))  # threads; each takes memory, and none beyond the cores helps
 _limit: int | None = None
 
@@ -50,6 +52,31 @@ def threads(workers: int | None = None) -> Iterator[ThreadPoolExecutor]:
     kernel_threads = max(1, numba.get_num_threads() // count)
     with ThreadPoolExecutor(count, initializer=numba.set_num_threads, initargs=(kernel_threads,)) as executor:
         yield executor
+
+
+def spread(kernel: Callable[..., object], count: int, *arguments: object, few: int = 1) -> None:
+    """Call `kernel(begin, end, *arguments)` for all parts of `range(count)`, on the cores that this thread may use.
+
+    Compiling a kernel that has threads of its own takes more than twice as long.
+
+    Parameters
+    ----------
+    kernel : callable
+        Works on the items from `begin` to `end` and doesn't hold the interpreter. No part depends on another.
+    count : int
+    *arguments
+    few : int
+        So many items are not worth waking other threads for.
+    """
+    workers = min(numba.get_num_threads(), count)
+    if workers <= 1 or count <= few:
+        kernel(0, count, *arguments)
+        return
+    borders = [count * k // (_PARTS * workers) for k in range(_PARTS * workers + 1)]
+    with ThreadPoolExecutor(workers) as pool:
+        parts = [pool.submit(kernel, a, b, *arguments) for a, b in pairwise(borders) if b > a]
+        for part in parts:
+            part.result()
 
 
 def map_items(

@@ -7,7 +7,7 @@ import math
 from numba import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def shade(triangle, uv, directions, faces, normals, colors, alpha, rim, key, above, rgba):
     """Colour and opacity of the points that rays hit: soft light, some from above, and a faint highlight.
 

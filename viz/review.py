@@ -32,6 +32,7 @@ from viz.sections import (
     figures_of_quality,
     key_figures,
     lead,
+    preview_note,
     record_blocks,
     section,
     summary,
@@ -116,7 +117,7 @@ def review(
     desk.step()
     turns = None if stage is None else turntable(results, stage)
     desk.step()
-    head = [*changed_files(results), *verdict(results), *summary(quality)]
+    head = [*preview_note(results), *changed_files(results), *verdict(results), *summary(quality)]
     parts = [
         section("Result", [*head, *_result(results, stage, chosen, turns, desk)]),
         section("What went in", _inputs(results, stage, chosen, desk)),

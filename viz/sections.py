@@ -146,6 +146,19 @@ def verdict(results: Results) -> list[Block]:
     return [Block("fine", f"{words} Model, cameras and paths agree.")]
 
 
+def preview_note(results: Results) -> list[Block]:
+    """Return that the run is a preview only, if it is."""
+    preview = results.record.get("source", {}).get("preview")
+    if preview is None:
+        return []
+    every = "every frame" if preview["every"] == 1 else f"one frame in {preview['every']}"
+    words = (
+        f"This is a preview: {every}, images reduced to about {preview['longest']} pixels. It tells whether cameras, "
+        "silhouettes and bodies come out right, not how precise the motion will be: run again without --preview."
+    )
+    return [Block("warnings", items=(words,))]
+
+
 def changed_files(results: Results) -> list[Block]:
     """Return which files that the report shows are no longer as the run wrote them."""
     faults = {name: fault for name, fault in results.run.faults().items() if not name.startswith("review/")}

@@ -50,7 +50,7 @@ class Dendrogram:
         return np.argsort(np.argsort(first))[inverse].astype(np.int32)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _nearest(row: np.ndarray, linked: np.ndarray, alive: np.ndarray, i: int) -> tuple[int, float]:
     best, at = _NEVER, -1
     for j in range(len(row)):
@@ -59,7 +59,7 @@ def _nearest(row: np.ndarray, linked: np.ndarray, alive: np.ndarray, i: int) -> 
     return at, best
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _link(distances: np.ndarray, linked: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     count = len(distances)
     alive = np.ones(count, np.bool_)

@@ -6,11 +6,12 @@ import numba
 import numpy as np
 
 from geomocap.model.rotations import nearest_rotation
+from geomocap.scheduling import spread
 
 _LEAST_FRAMES = 8
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _moments_of(i, positions, reference, weights, first, members, nearness, moments):
     """Add up the moments of sample i."""
     center = np.empty(3)
@@ -40,10 +41,10 @@ def _moments_of(i, positions, reference, weights, first, members, nearness, mome
                     moments[i, t, a, b] += moved * (reference[j, b] - start[b])
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
-def _local_moments(positions, reference, weights, first, members, nearness, moments):
-    for i in numba.prange(len(weights)):
-        _moments_of(np.int64(i), positions, reference, weights, first, members, nearness, moments)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _local_moments(begin, end, positions, reference, weights, first, members, nearness, moments):
+    for i in range(begin, end):
+        _moments_of(i, positions, reference, weights, first, members, nearness, moments)
 
 
 def local_rotations(
@@ -74,15 +75,14 @@ def local_rotations(
     first = np.concatenate([[0], np.cumsum(near.sum(axis=1))])
     nearness = np.exp(-((geodesics[rows, members] / (0.6 * radius)) ** 2))
     moments = np.zeros((*weights.shape, 3, 3))
-    _local_moments(
-        np.ascontiguousarray(positions), np.ascontiguousarray(reference), weights, first, members, nearness, moments
-    )
+    arrays = np.ascontiguousarray(positions), np.ascontiguousarray(reference), weights, first, members, nearness
+    spread(_local_moments, len(weights), *arrays, moments)
     # what flat or thin neighbourhoods leave open stays as it was in the reference
     size = np.trace(moments, axis1=2, axis2=3)[..., None, None]
     return nearest_rotation(moments + (1e-9 * np.abs(size) + 1e-15) * np.eye(3))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _turns_of(i, flat, known, fraction, least_frames, result):
     """Compare sample i with those before it."""
     frames = known.shape[1]
@@ -110,10 +110,10 @@ def _turns_of(i, flat, known, fraction, least_frames, result):
         result[i, j] = result[j, i] = np.arccos(cosine)
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
-def _turn_distances(flat, known, fraction, least_frames, result):
-    for i in numba.prange(len(known)):
-        _turns_of(np.int64(i), flat, known, fraction, least_frames, result)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _turn_distances(begin, end, flat, known, fraction, least_frames, result):
+    for i in range(begin, end):
+        _turns_of(i, flat, known, fraction, least_frames, result)
 
 
 def turn_distances(
@@ -144,5 +144,6 @@ def turn_distances(
         rotations, known = rotations[:, looked_at], known[:, looked_at]
     flat = np.ascontiguousarray(rotations.reshape(*known.shape, 9), np.float32)
     result = np.zeros((count, count), np.float32)
-    _turn_distances(flat, np.ascontiguousarray(known), fraction, min(_LEAST_FRAMES, known.shape[1]), result)
+    least = min(_LEAST_FRAMES, known.shape[1])
+    spread(_turn_distances, count, flat, np.ascontiguousarray(known), fraction, least, result)
     return result

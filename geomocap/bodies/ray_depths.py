@@ -21,6 +21,7 @@ from geomocap.bodies.rigid_motions import fit_rigid_motion
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.small_systems import solve_symmetric
 from geomocap.progress import Progress, silent
+from geomocap.scheduling import spread
 
 _DEPTH_FRACTION = 0.05  # of what is missed along a ray, counts for a sample's place
 _ROUNDS = 2  # in which samples choose bodies and these move anew
@@ -195,7 +196,7 @@ def _place(paths: MotionPaths, rotations: np.ndarray, translations: np.ndarray) 
     return _RestPlaces(*found)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _place_sample(i, m, positions, seen, ray, rotations, translations, depth_fraction, largest, rest, miss, depth):
     """Place sample i with motion m; parameters as of `place_samples`, its results filled."""
     part = 1.0 - depth_fraction**2
@@ -241,11 +242,13 @@ def _place_sample(i, m, positions, seen, ray, rotations, translations, depth_fra
     miss[i] = np.sqrt(square / max(number, 1))
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
-def _place_all(motion, positions, seen, ray, rotations, translations, depth_fraction, largest, rest, miss, depth):
-    for i in numba.prange(len(seen)):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _place_all(
+    begin, end, motion, positions, seen, ray, rotations, translations, depth_fraction, largest, rest, miss, depth
+):
+    for i in range(begin, end):
         _place_sample(
-            np.int64(i),
+            i,
             motion[i],
             positions,
             seen,
@@ -295,5 +298,6 @@ def place_samples(
     count, frames = seen.shape
     rest, miss, depth = np.zeros((count, 3)), np.zeros(count), np.zeros((count, frames))
     motion = np.arange(count) if len(rotations) > 1 else np.zeros(count, np.int64)
-    _place_all(motion, positions, seen, ray, rotations, translations, depth_fraction, largest, rest, miss, depth)
+    arrays = motion, positions, seen, ray, rotations, translations
+    spread(_place_all, count, *arrays, depth_fraction, largest, rest, miss, depth)
     return rest, miss, depth

@@ -9,6 +9,7 @@ import numpy as np
 
 from geomocap.model.motion_paths import DEPTH_FRACTION
 from geomocap.model.small_systems import solve_symmetric
+from geomocap.scheduling import spread
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Blends:
     fraction: np.ndarray
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _place_at_rest(positions, weights, total, ray, rotations, translations, place):
     """Place of a sample at rest by one body's motion, least squares over the frames; weights sum to `total`."""
     place[:] = 0.0
@@ -61,7 +62,7 @@ def _place_at_rest(positions, weights, total, ray, rotations, translations, plac
         solve_symmetric(normal, place, place)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _explain_one(
     i,
     positions,
@@ -148,8 +149,10 @@ def _explain_one(
                 fraction[i, main] = part
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _explain(
+    begin,
+    end,
     positions,
     weights,
     ray,
@@ -165,9 +168,9 @@ def _explain(
     partner,
     fraction,
 ):
-    for i in numba.prange(len(weights)):
+    for i in range(begin, end):
         _explain_one(
-            np.int64(i),
+            i,
             positions,
             weights,
             ray,
@@ -222,7 +225,9 @@ def explain(
     """
     shape = (len(weights), len(rotations))
     blends = Blends(np.full(shape, np.inf), np.full(shape, -1, np.int32), np.ones(shape))
-    _explain(
+    spread(
+        _explain,
+        len(weights),
         np.ascontiguousarray(positions),
         weights,
         np.zeros((len(weights), 0, 3)) if ray is None else np.ascontiguousarray(ray, float),

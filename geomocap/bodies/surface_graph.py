@@ -9,6 +9,8 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from geomocap.scheduling import spread
+
 FRAMES_LOOKED_AT = 20
 _FAR = np.float32(1e9)
 _BRIDGE = 3.0  # times the usual distance of neighbours
@@ -49,7 +51,7 @@ def frames_looked_at(frames: int, most: int = FRAMES_LOOKED_AT) -> np.ndarray:
     return np.unique(np.linspace(0, frames - 1, min(frames, most)).round().astype(int))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _distances_of(i, positions, rank, result):
     """Fill row i."""
     best = np.empty(rank)
@@ -71,10 +73,10 @@ def _distances_of(i, positions, rank, result):
         result[i, j] = np.sqrt(best[0])
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
-def _lasting_distances(positions, rank, result):
-    for i in numba.prange(len(positions)):
-        _distances_of(np.int64(i), positions, rank, result)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _lasting_distances(begin, end, positions, rank, result):
+    for i in range(begin, end):
+        _distances_of(i, positions, rank, result)
 
 
 def lasting_distances(positions: np.ndarray) -> np.ndarray:
@@ -95,11 +97,12 @@ def lasting_distances(positions: np.ndarray) -> np.ndarray:
     looked_at = frames_looked_at(positions.shape[1])
     rank = 3 if len(looked_at) >= 12 else 1
     result = np.zeros((len(positions), len(positions)), np.float32)
-    _lasting_distances(np.ascontiguousarray(positions[:, looked_at], np.float64), rank, result)
+    some = np.ascontiguousarray(positions[:, looked_at], np.float64)
+    spread(_lasting_distances, len(some), some, rank, result)
     return result
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _bridges_of(i, apart, limit, result):
     """Fill row i."""
     count = len(apart)
@@ -115,10 +118,10 @@ def _bridges_of(i, apart, limit, result):
         result[i, j] = not between
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
-def _bridges(apart, limit, result):
-    for i in numba.prange(len(apart)):
-        _bridges_of(np.int64(i), apart, limit, result)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _bridges(begin, end, apart, limit, result):
+    for i in range(begin, end):
+        _bridges_of(i, apart, limit, result)
 
 
 def bridges(apart: np.ndarray, limit: np.ndarray) -> np.ndarray:
@@ -139,7 +142,7 @@ def bridges(apart: np.ndarray, limit: np.ndarray) -> np.ndarray:
         Symmetric.
     """
     result = np.zeros(apart.shape, bool)
-    _bridges(apart, limit.astype(np.float32), result)
+    spread(_bridges, len(apart), apart, limit.astype(np.float32), result)
     return result
 
 

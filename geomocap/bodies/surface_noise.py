@@ -17,6 +17,7 @@ from geomocap.bodies.rigid_motions import fit_rigid_motion
 from geomocap.bodies.surface_graph import SurfaceGraph, frames_looked_at
 from geomocap.model.motion_paths import sure_part
 from geomocap.model.rotations import nearest_rotation
+from geomocap.scheduling import spread
 
 _RING = (0.03, 0.06)  # diagonals; a disc of the inner radius is about a hundredth of the surface of a person
 _SPACINGS = 5.0  # the ring's outer radius is at least so many times the distance of neighbours
@@ -131,7 +132,7 @@ def _miss_across(
     return positions[i] - translations - rotations @ place
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _moments_of(i, positions, weights, reference, first, members, center, start, moments):
     """Fill row i: weighted means of a ring now and at rest, and the moments about these."""
     for t in range(weights.shape[1]):
@@ -154,10 +155,10 @@ def _moments_of(i, positions, weights, reference, first, members, center, start,
                     moments[i, t, a, b] += moved * (reference[j, b] - start[i, t, b])
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
-def _ring_moments(positions, weights, reference, first, members, center, start, moments):
-    for i in numba.prange(len(weights)):
-        _moments_of(np.int64(i), positions, weights, reference, first, members, center, start, moments)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _ring_moments(begin, end, positions, weights, reference, first, members, center, start, moments):
+    for i in range(begin, end):
+        _moments_of(i, positions, weights, reference, first, members, center, start, moments)
 
 
 def ring_misses(positions: np.ndarray, weights: np.ndarray, reference: np.ndarray, ring: np.ndarray) -> np.ndarray:
@@ -178,7 +179,8 @@ def ring_misses(positions: np.ndarray, weights: np.ndarray, reference: np.ndarra
     first = np.concatenate([[0], np.cumsum(ring.sum(axis=1))])
     center, start = np.zeros_like(positions), np.zeros_like(positions)
     moments = np.zeros((*weights.shape, 3, 3))
-    _ring_moments(positions, weights, np.ascontiguousarray(reference), first, members, center, start, moments)
+    arrays = positions, weights, np.ascontiguousarray(reference), first, members, center, start, moments
+    spread(_ring_moments, len(weights), *arrays)
     rotations = nearest_rotation(moments + 1e-12 * np.eye(3))
     away = ((positions - center)[:, :, None] @ rotations)[:, :, 0] + start
     fraction = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)

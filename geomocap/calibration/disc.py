@@ -19,7 +19,7 @@ N_UNKNOWNS = 10
 _NODES, _WEIGHTS = (a.copy() for a in np.polynomial.legendre.leggauss(12))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def blurred_disc(r, R, s):
     """Return a blurred disc's brightness at distance r from its centre, and the derivatives by r, R and s.
 
@@ -56,7 +56,7 @@ def blurred_disc(r, R, s):
     return value, by_r, by_R, -(r * by_r + R * by_R) / s
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _drop_surroundings(image, u, part, x0, y0):
     """Take pixels out of `part` that lie outside the target and contradict the background; return how many."""
     m0, m1, m2 = 1.0 + u[5], u[6], 1.0 - u[5]
@@ -88,7 +88,7 @@ def _drop_surroundings(image, u, part, x0, y0):
     return dropped
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def fit_disc(image, x, y, radius, blur, reach, saturation, result):
     """Fit the target model to an image around a first guess (Levenberg–Marquardt).
 

@@ -15,7 +15,7 @@ from geomocap.calibration.projection import project_point
 from geomocap.calibration.target_observations import TargetObservations
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def identify_frame(pixels, ideal, interior, R, t, length, length_tolerance, threshold, chosen):
     """Find the bar in one frame.
 

@@ -12,7 +12,7 @@ from numba import njit
 from geomocap.calibration.projection import project_point
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def linearize(
     interior,
     view_camera,
@@ -114,7 +114,7 @@ def linearize(
     return cost, U, gc, Vp, gp, W
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def residuals(interior, view_camera, rotation, translation, bars, bar, view, end, pixels):
     """Project all observed points: (M, 2) float, computed minus observed, pixels; NaN behind a camera."""
     J = np.empty((2, 22))
@@ -130,7 +130,7 @@ def residuals(interior, view_camera, rotation, translation, bars, bar, view, end
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def reduce_bars(Vp, gp, W, group_view, bar_groups, n_views, damping):
     """Eliminate the bars.
 
@@ -187,7 +187,7 @@ def reduce_bars(Vp, gp, W, group_view, bar_groups, n_views, damping):
     return S, b, inverse
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def back_substitute(inverse, gp, W, group_view, bar_groups, step):
     """Return the bars' step (P, 6) that goes with the views' step (V, F)."""
     out = np.empty_like(gp)

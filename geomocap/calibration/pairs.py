@@ -35,7 +35,7 @@ class Pairing:
     used: int
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def score_pairings(Fs, a, b, threshold, best, swapped):
     """Truncated squared Sampson distances of hypotheses, each frame with its better pairing.
 

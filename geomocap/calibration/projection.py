@@ -23,7 +23,7 @@ N_PARAMETERS = 19
 """Interior parameters, then rotation (3) and translation (3) of the view."""
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def project_point(q, R, t, X, xy, J):
     """Project one point and differentiate.
 

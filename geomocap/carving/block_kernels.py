@@ -6,14 +6,16 @@ All kernels that share `classify` stand in this file: Numba's cache notices chan
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from geomocap.scheduling import spread
 
 BLOCK = 32  # edge of the blocks that are handed to threads: one word of the occupancy, so that no two share any
 LEVELS = 5  # blocks of 32, 16, 8, 4 and 2 voxels
 BACKGROUND, SUBJECT, UNSEEN, MIXED = 0, 1, 2, 3
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _sum_up(c, masks, out):
     """Fill the table of camera c, which holds zeros."""
     H, W = masks.shape[1:]
@@ -26,21 +28,21 @@ def _sum_up(c, masks, out):
             out[c, v + 1, u] += out[c, v, u]
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _sum_all(masks, out):
-    for c in prange(len(masks)):
-        _sum_up(np.int64(c), masks, out)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sum_all(begin, end, masks, out):
+    for c in range(begin, end):
+        _sum_up(c, masks, out)
 
 
 def summed(masks: np.ndarray) -> np.ndarray:
     """Summed-area tables (C, H + 1, W + 1) int32 of masks (C, H, W) of 0 and 1."""
     C, H, W = masks.shape
     out = np.zeros((C, H + 1, W + 1), np.int32)
-    _sum_all(masks, out)
+    spread(_sum_all, C, masks, out)
     return out
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def classify(P, size, subject, seen, unseen, c, x, y, z, dx, dy, dz):
     """Say what camera c says of all points within ±(dx, dy, dz) of (x, y, z), or MIXED if it can't be told.
 
@@ -98,7 +100,7 @@ def classify(P, size, subject, seen, unseen, c, x, y, z, dx, dy, dz):
     return BACKGROUND if inside and visible == area else MIXED
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _carve_block(
     corner_i,
     corner_j,
@@ -212,17 +214,23 @@ def _carve_block(
                         bits[i, j, k >> 5] |= np.uint32(1 << (k & 31))
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def carve(P, size, masks, valid, subject, seen, unseen, tolerance, min_views, origin, edge, Z, bits):
-    """Carve all blocks, one a task."""
+def block_count(bits: np.ndarray) -> int:
+    """Count the blocks of an occupancy (X, Y, Z / 32)."""
     X, Y, nz = bits.shape
-    nx, ny = (X + BLOCK - 1) // BLOCK, (Y + BLOCK - 1) // BLOCK
-    for b in prange(nx * ny * nz):
+    return ((X + BLOCK - 1) // BLOCK) * ((Y + BLOCK - 1) // BLOCK) * nz
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def carve(begin, end, P, size, masks, valid, subject, seen, unseen, tolerance, min_views, origin, edge, Z, bits):
+    """Carve the blocks from `begin` to `end`, counted along z first."""
+    nz = bits.shape[2]
+    ny = (bits.shape[1] + BLOCK - 1) // BLOCK
+    for b in range(begin, end):
         i, j, k = b // (ny * nz) * BLOCK, b // nz % ny * BLOCK, b % nz * BLOCK
         _carve_block(i, j, k, P, size, masks, valid, subject, seen, unseen, tolerance, min_views, origin, edge, Z, bits)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def possible(P, size, subject, seen, unseen, tolerance, min_views, origin, edge, cells):
     """Mark the cells that may hold a point of the hull: every camera either may, or can't tell."""
     half = 0.5 * edge

@@ -36,7 +36,7 @@ def voxel_colors(views: PinholeViews, images: np.ndarray, grid: Grid, occupancy:
     return colors
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _blend(seen, samples, positions, normal, centers, colors, has_color):
     N, C = seen.shape
     for n in range(N):

@@ -91,7 +91,7 @@ def color_deviation(seen: VoxelVisibility, gains: np.ndarray, min_cameras: int) 
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _deviate(seen, colors, low, high, gains, min_cameras, out):
     N, C = seen.shape
     for n in range(N):
@@ -122,7 +122,7 @@ def _deviate(seen, colors, low, high, gains, min_cameras, out):
         out[n] = np.sqrt(total / (3 * count)) if count >= min_cameras else np.float32(-1)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _near(changed, surface):
     """Mark the surface voxels within a word or so of a change; what is farther away is not judged again."""
     X, Y, K = changed.shape
@@ -136,7 +136,7 @@ def _near(changed, surface):
     return near
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _judge(voxels, deviation, threshold, judged, bad):
     """Write into the bits which voxels could be judged and which are inconsistent."""
     for n in range(len(voxels)):
@@ -150,7 +150,7 @@ def _judge(voxels, deviation, threshold, judged, bad):
                 bad[i, j, k >> 5] |= bit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _take(bits, surface, support, judged, bad, changed):
     """Take from `bits` the inconsistent voxels whose surroundings (5³) are inconsistent too; return how many."""
     X, Y, K = bits.shape

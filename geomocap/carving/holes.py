@@ -117,7 +117,7 @@ def _thickness(rig: Rig, camera: int, pixels: np.ndarray, dissent: np.ndarray, g
     return _march(np.ascontiguousarray(origin), directions, dissent, camera, grid.origin, grid.voxel_size)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _find_dissent(P, masks, valid, unseen, occupied, origin, edge, dissent):
     """Write into each voxel of the hull which camera calls it background; NOBODY if none does."""
     C, H, W = masks.shape
@@ -136,7 +136,7 @@ def _find_dissent(P, masks, valid, unseen, occupied, origin, edge, dissent):
                 dissent[i, j, k] = c
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _march(origin, directions, dissent, camera, low, edge):
     """Walk along rays in steps of a voxel and sum the steps on which all other cameras agree."""
     X, Y, Z = dissent.shape

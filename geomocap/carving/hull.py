@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from geomocap.carving.block_kernels import carve, summed
+from geomocap.carving.block_kernels import block_count, carve, summed
 from geomocap.carving.carving_settings import HullSettings
 from geomocap.carving.occupancy import Occupancy
 from geomocap.carving.silhouette_views import PinholeViews
 from geomocap.carving.voxel_grid import Grid
+from geomocap.scheduling import spread
 
 _DEFAULT = HullSettings()
 
@@ -34,7 +35,9 @@ def hull(views: PinholeViews, grid: Grid, settings: HullSettings = _DEFAULT) -> 
     occupancy = Occupancy.empty(grid.shape)
     subject = summed(views.masks)
     seen = summed(views.valid) if unseen.any() else subject
-    carve(
+    spread(
+        carve,
+        block_count(occupancy.bits),
         views.projections,
         rounding_bounds(views, grid),
         views.masks,

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from geomocap.scheduling import spread
 
 
 @dataclass(frozen=True)
@@ -45,9 +47,9 @@ class Occupancy:
         """
         if out is None:
             out = np.zeros(self.shape, np.uint8)
-            _unpack(self.bits, out, False)
+            spread(_unpack, len(out), self.bits, out, False)
         else:
-            _unpack(self.bits, out, True)
+            spread(_unpack, len(out), self.bits, out, True)
         return out
 
     def surface(self) -> Occupancy:
@@ -68,7 +70,7 @@ class Occupancy:
         return int(_slab_counts(self.bits).sum())
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _popcount(word):
     word = np.uint64(word)
     word = word - ((word >> np.uint64(1)) & np.uint64(0x55555555))
@@ -77,7 +79,7 @@ def _popcount(word):
     return np.int64(((word * np.uint64(0x01010101)) & np.uint64(0xFFFFFFFF)) >> np.uint64(24))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _slab_counts(bits):
     """Count the set bits of every x index."""
     X, Y, K = bits.shape
@@ -90,7 +92,7 @@ def _slab_counts(bits):
     return counts
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _slab_surface(i, bits, surface, counts):
     """Keep the bits of x index i with an unset one among their six neighbours, and count them; filled in place."""
     X, Y, K = bits.shape
@@ -116,20 +118,20 @@ def _slab_surface(i, bits, surface, counts):
     counts[i] = count
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _slab_surfaces(bits, surface, counts):
-    for i in prange(len(bits)):
-        _slab_surface(np.int64(i), bits, surface, counts)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _slab_surfaces(begin, end, bits, surface, counts):
+    for i in range(begin, end):
+        _slab_surface(i, bits, surface, counts)
 
 
 def _surface(bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the bits with an unset one among their six neighbours, and how many there are at every x index."""
     surface, counts = np.zeros_like(bits), np.zeros(len(bits), np.int64)
-    _slab_surfaces(bits, surface, counts)
+    spread(_slab_surfaces, len(bits), bits, surface, counts)
     return surface, counts
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _indices(bits, counts):
     """List the set bits, in order; `counts` are those of every x index."""
     X, Y, K = bits.shape
@@ -152,12 +154,12 @@ def _indices(bits, counts):
     return out
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _unpack(bits, out, clear):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _unpack(begin, end, bits, out, clear):
     """Write the bits into bytes; zeros only if `clear`."""
-    X, Y, K = bits.shape
+    Y, K = bits.shape[1:]
     Z = out.shape[2]
-    for i in prange(X):
+    for i in range(begin, end):
         for j in range(Y):
             for k in range(K):
                 word = bits[i, j, k]

@@ -133,7 +133,7 @@ def _centers(P: np.ndarray) -> np.ndarray:
     return -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[:, :, 0]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _free_faces(bits, surface):
     X, Y, K = bits.shape
     steps = ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))
@@ -149,7 +149,7 @@ def _free_faces(bits, surface):
     return faces
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _faces_camera(faces, dx, dy, dz, half):
     """Whether a free face is turned to a camera that lies (dx, dy, dz) from the voxel's centre."""
     turned = (dx < -half) | (dx > half) << 1 | (dy < -half) << 2 | (dy > half) << 3
@@ -157,7 +157,7 @@ def _faces_camera(faces, dx, dy, dz, half):
     return (turned & faces) != 0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _draw(P, centers, surface, faces, origin, edge, depth):
     C, H, W = depth.shape
     half = 0.5 * edge
@@ -191,7 +191,7 @@ def _draw(P, centers, surface, faces, origin, edge, depth):
                         depth[c, row, column] = d
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _look(
     P, centers, masks, valid, images, depth, surface, faces, origin, edge, slack, window, seen, colors, low, high
 ):
@@ -246,7 +246,7 @@ def _look(
             high[n, c, 0], high[n, c, 1], high[n, c, 2] = r1, g1, b1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _away(bits, surface):
     X, Y, K = bits.shape
     # of five bits along z: how many are set, and the sum of their offsets −2 … 2

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
+
+GARBAGE = 100_000  # objects made before those not needed are looked for: compiling and importing make many that stay
 
 
 def main() -> None:
@@ -12,6 +15,7 @@ def main() -> None:
     from geomocap.errors import GeomocapError
     from geomocap.reading import reason
 
+    gc.set_threshold(GARBAGE)
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # what it stumbles over, the one line says
     try:
         app()

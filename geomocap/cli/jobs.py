@@ -13,6 +13,7 @@ from geomocap.cli.reports import agreeing_job, tell_note, working
 from geomocap.config import Config
 from geomocap.errors import GeomocapError, RunError
 from geomocap.files.capture import Capture
+from geomocap.files.preview import PreviewCapture
 from geomocap.files.run import Run
 from geomocap.files.scans import open_scans
 from geomocap.pipeline.job import Job
@@ -31,9 +32,15 @@ def capture_job(
     model: Path | None = None,
     *,
     wait: bool = False,
+    preview: bool = False,
 ) -> Iterator[Job]:
-    """Make the job of a capture, with the subject's model if there is one."""
+    """Make the job of a capture or of its preview, with the subject's model if there is one."""
     opened = Capture.open(capture)
+    if preview:
+        opened = PreviewCapture.of(opened)
+        tell_note(
+            f"preview: {opened.n_frames} frames, {opened.fps:.3g} a second, images of about {opened.longest} pixels"
+        )
     _check_apart(capture, run)
     _check_model(model, run)
     with suppress(GeomocapError):  # what is wrong with the cameras, the stages that need them say

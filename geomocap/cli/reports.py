@@ -14,6 +14,7 @@ from geomocap.files.atomic import fingerprint
 from geomocap.files.camera_file import read_camera_doubts
 from geomocap.files.capture import Capture
 from geomocap.files.corrected_cameras import as_seen
+from geomocap.files.preview import preview_of
 from geomocap.files.results import read_cloud_record, read_warnings
 from geomocap.files.run import Run, stage_key
 from geomocap.files.run_lock import working_in
@@ -96,7 +97,8 @@ def capture_of(run: Run) -> Capture | None:
     if source.get("kind") != "capture" or "path" not in source:
         return None
     try:
-        opened = without_left_out(Capture.open(Path(source["path"])), read_camera_doubts(run))
+        whole = preview_of(Capture.open(Path(source["path"])), source.get("preview"))
+        opened = without_left_out(whole, read_camera_doubts(run))
         return as_seen(run, opened)
     except GeomocapError as error:
         tell_note(f"the capture can't be shown ({error})")

@@ -122,6 +122,9 @@ def run(
     capture: CaptureFolder,
     run: RunFolder,
     config: Config,
+    preview: Annotated[
+        bool, typer.Option("--preview", help="A quick look: some frames a second, small images, the same report.")
+    ] = False,
     source: Annotated[Literal["voxels", "cloud"], typer.Option("--source", help="Geometry to work from.")] = "voxels",
     model: ModelFile = None,
     pictures: Pictures = True,
@@ -136,13 +139,16 @@ def run(
     With a model of the subject, saved as model.npz by a run of another sequence, bodies and joints are not looked for:
     the model is found in this sequence and followed through it.
 
+    With --preview every n-th frame is used, so that 12 a second are left, and images are reduced to about 320 pixels:
+    it tells in little time whether cameras, silhouettes and bodies come out right.
+
     Example: `geomocap run CAPTURE RUN --resolution 192 --bodies 15`
     """
     from geomocap import pipeline
     from geomocap.cli.jobs import capture_job
     from geomocap.cli.reports import review_job, tell_clouds, tell_results
 
-    with capture_job(capture, run, config, workers, scheduler, model, wait=wait) as job:
+    with capture_job(capture, run, config, workers, scheduler, model, wait=wait, preview=preview) as job:
         key = pipeline.motion_files(job, source)
         if pictures:
             review_job(job, key)

@@ -151,7 +151,7 @@ def _next_marker(data: bytes, at: int) -> int:
         at += 1
 
 
-@numba.njit(nogil=True, cache=True)
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def follow_codes(
     data: np.ndarray,
     at: int,

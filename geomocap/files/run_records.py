@@ -22,12 +22,18 @@ def _is_rate(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < float("inf")
 
 
+def _is_preview(value: Any) -> bool:
+    keys = ("every", "longest")
+    return isinstance(value, dict) and all(type(value.get(k)) is int and value[k] > 0 for k in keys)
+
+
 _EXPECTED: Mapping[tuple[str, str], tuple[Callable[[Any], bool], str]] = {
     ("geomocap", "version"): (_is_text, "a text"),
     ("source", "kind"): (_is_text, "a text"),
     ("source", "path"): (_is_text, "a path"),
     ("source", "model"): (_is_text, "a path"),
     ("source", "fps"): (_is_rate, "a number above 0"),
+    ("source", "preview"): (_is_preview, "a table with every and longest, whole numbers above 0"),
     ("source", "up"): (lambda value: value in ("x", "y", "z"), "x, y or z"),
 }
 

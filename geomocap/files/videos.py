@@ -17,6 +17,8 @@ from geomocap.reading import open_plain, reason
 
 VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,asf,flv,ogg"  # none that leads to other files
+KEPT = 64e6  # bytes of decoded frames that are kept
+LEAST_KEPT = 4  # frames, so that threads may ask for them in another order
 _UNREADABLE = (av.FFmpegError, IndexError, OSError, ValueError)
 
 
@@ -24,16 +26,17 @@ _UNREADABLE = (av.FFmpegError, IndexError, OSError, ValueError)
 class Video:
     """Frames of one camera in a video file, decoded one by one and never unpacked to disk.
 
-    Reading forwards is cheap; reading elsewhere seeks to the key frame before. May be shared by threads.
+    Reading forwards is cheap; reading elsewhere seeks to the key frame before. The frames decoded last are kept as the
+    video has them, so that reading backwards decodes each only a few times. May be shared by threads.
     """
 
     path: Path
-    kept: int = 8
+    kept: float = KEPT
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
     _container: av.container.InputContainer | None = field(default=None, repr=False)
     _frames: object = field(default=None, repr=False)
     _next: int = field(default=0, repr=False)
-    _recent: OrderedDict[int, np.ndarray] = field(default_factory=OrderedDict, repr=False)
+    _recent: OrderedDict[int, av.VideoFrame] = field(default_factory=OrderedDict, repr=False)
 
     def __getstate__(self) -> dict:
         return {"path": self.path, "kept": self.kept}
@@ -70,11 +73,16 @@ class Video:
                 try:
                     self._decode_to(frame)
                 except (*_UNREADABLE, StopIteration, MemoryError) as error:
-                    raise CaptureError(
-                        f"{self.path}: frame {frame} of {len(self)} can't be decoded ({_said(error)}); "
-                        "copy the file again"
-                    ) from None
-            return self._recent[frame]
+                    raise self._undecodable(frame, error) from None
+            try:
+                return self._recent[frame].to_ndarray(format="rgb24")
+            except (*_UNREADABLE, MemoryError) as error:
+                raise self._undecodable(frame, error) from None
+
+    def _undecodable(self, frame: int, error: Exception) -> CaptureError:
+        return CaptureError(
+            f"{self.path}: frame {frame} of {len(self)} can't be decoded ({_said(error)}); copy the file again"
+        )
 
     def _open(self) -> av.container.InputContainer:
         """Open the file as a container of pictures; a play list, which would lead to other files, is none."""
@@ -101,14 +109,18 @@ class Video:
                 raise CaptureError(f"{self.path}: damaged near frame {frame} of {len(self)}; copy the file again")
             index = int(np.searchsorted(times, picture.pts))
             self._next = index + 1
-            if index >= frame - self.kept // 2:
-                self._recent[index] = picture.to_ndarray(format="rgb24")
-                while len(self._recent) > self.kept:
-                    self._recent.popitem(last=False)
+            self._recent[index] = picture
+            while len(self._recent) > max(LEAST_KEPT, int(self.kept / _bytes(picture))):
+                self._recent.popitem(last=False)
             if index >= frame:
                 if index > frame:
                     raise CaptureError(f"{self.path}: frame {frame} is missing from the stream; copy the file again")
                 return
+
+
+def _bytes(picture: av.VideoFrame) -> int:
+    """Memory that a decoded picture takes."""
+    return max(1, sum(plane.buffer_size for plane in picture.planes))
 
 
 def _said(error: Exception) -> str:

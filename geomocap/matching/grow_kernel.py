@@ -35,7 +35,7 @@ _PATIENCE = 4
 _SHORT = 0.1  # what the correlation may lack of its limit after so many iterations
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def plane_start(transfers, x, y, plane, position, affine, point):
     """Put the warps that a plane induces around template index (x, y) into position and affine; False if behind."""
     for k in range(len(transfers)):
@@ -53,7 +53,7 @@ def plane_start(transfers, x, y, plane, position, affine, point):
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def plane_of(transfers, x, y, position, affine, use, plane, point):
     """Fit inverse depth and slope to the warps of the images in use."""
     plane[MU] = inverse_depth(transfers, x, y, position, use)
@@ -76,7 +76,7 @@ def plane_of(transfers, x, y, position, affine, use, plane, point):
     plane[SLOPE_Y] = sy / weight if weight > 0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _gate(masks, layout, searches, limits, floor, wanted, position, quality):
     """Apply the thresholds: failing images lose their place in `wanted`; return the number left."""
     count = 0
@@ -105,7 +105,7 @@ def _gate(masks, layout, searches, limits, floor, wanted, position, quality):
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def match_point(stack, template, searches, transfers, limits, x, y, radius, plane, position, affine, quality, work):
     """Match one point from the plane expected there, in as many images as pass the thresholds.
 
@@ -171,7 +171,7 @@ def match_point(stack, template, searches, transfers, limits, x, y, radius, plan
     return 0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def carry(plane, dx, dy, out):
     """Carry a plane (PLANE,) along a template offset."""
     out[:] = plane
@@ -179,7 +179,7 @@ def carry(plane, dx, dy, out):
     out[IMAGES] = 0
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def match_cells(
     flat,
     masks,
@@ -269,7 +269,7 @@ def match_cells(
                             radius = radii[1]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def best_neighbours(neighbours, planes, tries, attempts, last, source, key):
     """For every cell still to be tried, find the matched one of its four neighbours with the best key; else -1.
 

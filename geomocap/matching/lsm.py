@@ -265,7 +265,7 @@ def matches_of(position: np.ndarray, affine: np.ndarray, quality: np.ndarray, st
     )
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def _match_all(
     flat,
     masks,

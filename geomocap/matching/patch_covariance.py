@@ -12,7 +12,7 @@ from geomocap.model.small_systems import cholesky, solve
 _TWO_PI = 2 * math.pi
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def noise_kept(order, x, y, a11, a12, a21, a22, radius):
     """Fraction of white noise that spline values of a warped patch keep on average (product of two `NOISE_VALUE`).
 
@@ -32,7 +32,7 @@ def noise_kept(order, x, y, a11, a12, a21, a22, radius):
     return a0 * a0 + a0 * a1 * (cx + cy) + a1 * a1 * product
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _dirichlet(u, n):
     u -= math.floor(u + 0.5)
     s = math.sin(math.pi * u)
@@ -41,7 +41,7 @@ def _dirichlet(u, n):
     return math.sin(math.pi * n * u) / (n * s)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def covariance(order, ox, oy, radius, H, moments, s2, px, py, warp, M, v, out):
     """A-posteriori covariance of a position in the search image, with noise in both images.
 

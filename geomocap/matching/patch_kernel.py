@@ -34,7 +34,7 @@ STATUS, CORR, ITERATIONS, SIGMA0, CXX, CXY, CYY, GAIN, OFFSET, EPI, INVERSE_DEPT
 ACTIVE, START_X, START_Y, MEAN, VARIANCE = range(5)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def workspace(radius, images):
     """Allocate the buffers of `match_patch` for patches up to `radius` and so many search images."""
     n = 2 * radius + 1
@@ -54,7 +54,7 @@ def workspace(radius, images):
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def transfer(T, mu, x, y, out):
     """Where the template point (x, y) at inverse depth `mu` is seen, and its derivative by `mu`, into out[0:4]."""
     p0 = T[0] * x + T[1] * y + T[2]
@@ -70,7 +70,7 @@ def transfer(T, mu, x, y, out):
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def inverse_depth(transfers, x, y, position, use):
     """Inverse depth whose projections lie nearest to the positions in the images in use (algebraic least squares)."""
     num = den = 0.0
@@ -89,7 +89,7 @@ def inverse_depth(transfers, x, y, position, use):
     return num / den if den > 0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def match_patch(
     flat,
     masks,
@@ -318,7 +318,7 @@ def match_patch(
     return matched
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _nearest(layout, x, y):
     """Index of the coefficient nearest to (x, y), kept inside the image."""
     ix = min(max(int(x + 0.5), 0), layout[3] - 1)
@@ -326,7 +326,7 @@ def _nearest(layout, x, y):
     return layout[0] + iy * layout[1] + ix
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _compose(position, A, d):
     """Replace the warp W(p) by W(p) ∘ W(d)⁻¹; False if it can't be."""
     d11 = 1.0 + d[1]

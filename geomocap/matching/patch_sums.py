@@ -22,13 +22,13 @@ _VALUE = np.array([[1 / 6, 4 / 6, 1 / 6, 0, 0], [1 / 120, 26 / 120, 66 / 120, 26
 _SLOPE = np.array([[-1 / 2, 0, 1 / 2, 0, 0], [-1 / 24, -10 / 24, 0, 10 / 24, 1 / 24]], np.float32)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def padded(n):
     """Length of a row of `n` values in whole vectors; what is beyond has weight 0."""
     return (n + 7) // 8 * 8
 
 
-@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER)
 def sample_template(flat, start, stride, order, ix, iy, radius, patches):
     """Fill patches[0:3] with value and slopes of the spline at the pixels around pixel (ix, iy), by separable sums."""
     n = 2 * radius + 1
@@ -74,7 +74,7 @@ def sample_template(flat, start, stride, order, ix, iy, radius, patches):
                 GY[i, j] = d[4] * (value[i + 4, j] - value[i, j]) + d[3] * (value[i + 3, j] - value[i + 1, j])
 
 
-@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER)
 def template_mask(masks, start, stride, ix, iy, radius, W):
     """Fill W with 1 where the template may be used; return their number."""
     n = 2 * radius + 1
@@ -90,7 +90,7 @@ def template_mask(masks, start, stride, ix, iy, radius, W):
     return count
 
 
-@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER)
 def normal_equations(patches, radius, count, H, S, q1, qf, moments):
     """Centre F, form the 6×6 normal matrix from row moments and eliminate offset and gain; return Σ F²."""
     n = 2 * radius + 1
@@ -204,7 +204,7 @@ def normal_equations(patches, radius, count, H, S, q1, qf, moments):
     return ff
 
 
-@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER)
 def sample_and_project(flat, start, stride, order, px, py, warp, radius, patches, wx, wy, index, G, sums, b):
     """Sample the search image under the warp and sum what the right side needs, in one pass.
 

@@ -13,7 +13,7 @@ from numba import njit
 from geomocap.matching.grow_kernel import plane_start
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _correlate(flat, start, height, width, f, offsets, variance, position, affine, radius):
     """Normalised correlation of the centred template samples `f` at `offsets` with an image under a warp, bilinear."""
     ex = (abs(affine[0]) + abs(affine[1])) * radius
@@ -44,7 +44,7 @@ def _correlate(flat, start, height, width, f, offsets, variance, position, affin
     return sf / math.sqrt(spread * variance)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def on_plane(scene, x, y, plane, patch, work, only):
     """Mean correlation with the template patch laid on a plane, of all images or `only` one; each into `each`.
 
@@ -69,7 +69,7 @@ def on_plane(scene, x, y, plane, patch, work, only):
     return total / count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def template_patch(flat, seen, height, width, ix, iy, radius):
     """Centred samples of every second template pixel of the subject, their offsets, and the sum of their squares."""
     side = radius + 1
@@ -94,7 +94,7 @@ def template_patch(flat, seen, height, width, ix, iy, radius):
     return f[:n], offsets[:n], variance
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def refine(scene, x, y, plane, depth_step, slope_step, top, patch, work, trial, only):
     """Improve a plane, one unknown after the other with halved steps; returns its mean correlation."""
     for _ in range(4):

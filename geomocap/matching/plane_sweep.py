@@ -51,7 +51,7 @@ class SweepImages:
         return cls(np.concatenate([s.ravel() for s in smooth]), np.concatenate(seen), shapes, starts)
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def sweep(
     flat,
     seen,

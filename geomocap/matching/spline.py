@@ -152,7 +152,7 @@ class SplineImage:
         return int(self.stack.layout[0, 2]), int(self.stack.layout[0, 3])
 
 
-@njit(cache=True, nogil=True, fastmath=ANY_ORDER, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER, inline="always")
 def cubic_weights(t, w, j):
     """Put the four cubic B-spline weights at fraction `t` into column `j` of `w`."""
     t2 = t * t
@@ -164,7 +164,7 @@ def cubic_weights(t, w, j):
     w[3, j] = t3 * _SIXTH
 
 
-@njit(cache=True, nogil=True, fastmath=ANY_ORDER, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER, inline="always")
 def quintic_weights(t, w, j):
     """Put the six quintic B-spline weights at fraction `t` into column `j` of `w`."""
     u = _1 - t
@@ -178,7 +178,7 @@ def quintic_weights(t, w, j):
     w[5, j] = t2 * t2 * t * _I120
 
 
-@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER)
 def weights_and_derivatives(order, t, w, j):
     """Put the weights of spline `order` at fraction `t` into column `j` of `w`, their derivatives into `j + 1`."""
     u = _1 - t
@@ -200,7 +200,7 @@ def weights_and_derivatives(order, t, w, j):
         w[5, j + 1] = t2 * t2 * _I24
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def _sample_points(flat, layout, order, pixels, out):
     start, stride, height, width = layout
     for n in prange(len(pixels)):

@@ -118,7 +118,7 @@ def check_points(points: np.ndarray, frame: int, least: int) -> np.ndarray:
     return points
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def eigen_axes(moments: np.ndarray, variances: np.ndarray, axes: np.ndarray) -> None:
     """Eigenvalues (descending, at least `FLAT`) and axes of the covariance of one set of moments.
 
@@ -185,7 +185,7 @@ def eigen_axes(moments: np.ndarray, variances: np.ndarray, axes: np.ndarray) -> 
     variances[2] = max(a[k, k], FLAT)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def error_terms(
     points: np.ndarray, start: int, end: int, moments: np.ndarray, variances: np.ndarray, axes: np.ndarray
 ) -> float:
@@ -213,13 +213,13 @@ def error_terms(
     return total * (SHELL**1.5 * np.sqrt(variances[0] * variances[1] * variances[2])) ** 0.5
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def equivalent_length(mean: float) -> float:
     """Length to which the error D of eq. 2 (a length to the power 5/2) is equivalent: D^(2/5)."""
     return mean**0.4
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def range_moments(points: np.ndarray, start: int, end: int, m: np.ndarray) -> None:
     """Write the moments of points[start:end] to `m` (10,)."""
     m[:] = 0.0
@@ -237,7 +237,7 @@ def range_moments(points: np.ndarray, start: int, end: int, m: np.ndarray) -> No
         m[9] += z * z
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def all_axes(moments: np.ndarray, variances: np.ndarray, axes: np.ndarray) -> None:
     """Write `eigen_axes` of every set with points."""
     for k in range(moments.shape[0]):
@@ -245,7 +245,7 @@ def all_axes(moments: np.ndarray, variances: np.ndarray, axes: np.ndarray) -> No
             eigen_axes(moments[k], variances[k], axes[k])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def union_errors(
     points: np.ndarray, begin: np.ndarray, end: np.ndarray, union: np.ndarray, moments: np.ndarray
 ) -> np.ndarray:

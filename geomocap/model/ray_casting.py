@@ -97,7 +97,7 @@ def touched_pixels(corners: np.ndarray, faces: np.ndarray, width: int, height: i
     return np.repeat(np.repeat(tiles, _TILE, axis=0), _TILE, axis=1)[:height, :width]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def mark_tiles(corners, faces, tiles):
     """Set the tiles (rows, columns) that the boxes of triangles meet; `corners` (V, 2) must be finite."""
     rows, columns = tiles.shape

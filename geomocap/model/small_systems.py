@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def cholesky(H, L, least=1e-10):
     """Factorise H = L Lᵀ, (6, 6), lower triangle given; False if a pivot is not above `least` times its diagonal."""
     for i in range(6):
@@ -25,7 +25,7 @@ def cholesky(H, L, least=1e-10):
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def solve(L, b, x):
     """Solve L Lᵀ x = b for x (6,)."""
     for i in range(6):
@@ -40,7 +40,7 @@ def solve(L, b, x):
         x[i] = s / L[i, i]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def inverse_diagonal(L, out):
     """Diagonal of (L Lᵀ)⁻¹, with L (6, 6) lower triangular, into `out` (6,): the squares of L⁻¹ summed over rows."""
     column = np.empty(6)
@@ -54,7 +54,7 @@ def inverse_diagonal(L, out):
             out[r] += column[i] * column[i]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def solve_symmetric(N, b, x):
     """Solve N x = b for x (3,) by cofactors; N (3, 3) symmetric and positive definite, `x` may be `b`."""
     xx, xy, xz = (

@@ -116,7 +116,7 @@ def pull(
     return Pull(A, b, forth_weight, across, energy)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def gather_pulls(y, q, n, found, forth_weight, taker, back_weight, point_weight):
     """Sum up what points pull at samples: A (S, 3, 3) and b (S, 3).
 

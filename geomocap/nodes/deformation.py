@@ -63,7 +63,7 @@ def block_pattern(graph: NodeGraph) -> BlockPattern:
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def normal_equations(
     x, R, nodes, edges, edge_weights, binding, weights, offsets, A, b, diagonal, of_edges, of_samples, n_blocks
 ):
@@ -176,7 +176,7 @@ def normal_equations(
     return H, g
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def solve_blocks(H, g, start, column, diagonal, iterations, tolerance):
     """Solve H z = g by conjugate gradients with block-diagonal preconditioner; returns z (N, 6).
 

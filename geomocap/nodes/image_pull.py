@@ -132,7 +132,7 @@ def _first(flags: np.ndarray) -> np.ndarray:
     return flags.argmax(axis=1)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _value(image, x, y):
     j, i = int(x), int(y)
     a, b = x - j, y - i
@@ -141,7 +141,7 @@ def _value(image, x, y):
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def window_pulls(now, then, P, Q, mask_now, mask_then, y, e, y0, e0, step, seen, half, A, b, error, count):
     """Gather what the windows of all samples in all cameras ask, with σ = 1.
 

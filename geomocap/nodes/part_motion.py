@@ -45,7 +45,7 @@ class RigidParts:
         return RigidParts(label, self.R[kept], self.t[kept], self.rests[kept])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def carry_samples(R, t, label, samples, normals, binding, weights):
     """Samples (S, 3) and their normals (S, 3) as the parts of their nodes carry them, with the nodes' fractions.
 
@@ -66,7 +66,7 @@ def carry_samples(R, t, label, samples, normals, binding, weights):
     return y, n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def part_equations(R, t, middle, label, samples, binding, weights, A, b, nodes, hinges, hold):
     """Normal equations H (6B, 6B), right side (6B,) of the parts' steps: turn about the middle, and shift.
 

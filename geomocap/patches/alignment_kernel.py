@@ -27,7 +27,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from geomocap.model.small_systems import cholesky, inverse_diagonal, solve
 from geomocap.patches.patch_samples import choose_samples, compare, sum_of_products
@@ -35,12 +35,13 @@ from geomocap.patches.patch_templates import local_camera, set_place, turn_by
 
 _FLOOR = 1.0  # noise of an image that even a perfect fit is granted, grey levels
 COHERENT = 0.15  # fraction of the samples over which residuals beyond that go together
-_TOGETHER = 32  # patches of a thread before it asks for more
 _GAIN = 3.0  # most contrast that an image may lose or win against the template
 
 
-@njit(cache=True, nogil=True)
-def _align_some(
+@njit(cache=True, nogil=True, error_model="numpy")
+def align_patches(
+    begin,
+    end,
     which,
     X,
     Q,
@@ -67,7 +68,49 @@ def _align_some(
     correlation,
     covariance,
 ):
-    """Align patches `which` one after the other, with the same scratch arrays; parameters as of `align_patches`."""
+    """Align patches with one level of a frame, in place.
+
+    Parameters
+    ----------
+    begin, end : int
+        The part of `which` to align.
+    which : (A,) int
+        Patches to align.
+    X, Q : (N, 3), (N, 3, 3) float
+        Places at the start; replaced by those found.
+    shape : (N, M, 5) float
+    size : (N,) float
+        What a pixel covers on the patch, metres: the unit in which steps are limited.
+    rows : (N,) int
+        Where the patches have their templates.
+    templates : (R, C, L, M, 3) float32
+    usable : (R, C, M) uint8
+    doubt : (N, C) float
+        Standard deviation of the place at which each template was taken, metres.
+    use : (N, C) uint8
+        Cameras to align with.
+    images : (C, H, W) float32
+    level : int
+        Level of the templates.
+    stride : int
+        Use every so many of the samples; 2 is a chequerboard, enough for blurred images.
+    masks : (C, H, W) uint8
+    use_mask : bool
+        Whether samples outside the silhouettes are left out.
+    P, centers : (C, 3, 4), (C, 3) float
+    prior_X, prior_Q : (N, 3), (N, 3, 3) float
+        Where the patches are expected.
+    prior_shift, prior_turn : (N,) float
+        Standard deviations of that, metres and radians.
+    iterations : int
+        At most; 0 only compares.
+    least_correlation : float
+        Cameras below it are left out while better ones are there.
+    correlation : (N, C) float
+        Filled: correlation in each camera, −1 where it has no part.
+    covariance : (N, 6) float
+        Filled: variances of shift (m²) and turn (rad²) along the patch's own axes; NaN without solution.
+    """
     M = shape.shape[1]
     C = use.shape[1]
     A = np.empty((C, 3, 4))
@@ -90,7 +133,7 @@ def _align_some(
     r6, x6, local = np.empty(6), np.empty(6), np.empty(3)
     x_n, q_n, q_new = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     best_x, best_q = np.empty(3), np.empty((3, 3))
-    for n in which:
+    for n in which[begin:end]:
         set_place(x_n, q_n, X[n], Q[n])
         set_place(best_x, best_q, x_n, q_n)
         best = -2.0
@@ -209,102 +252,3 @@ def _align_some(
         set_place(X[n], Q[n], best_x, best_q)
         if solved:
             inverse_diagonal(L6, covariance[n])
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def align_patches(
-    which,
-    X,
-    Q,
-    shape,
-    size,
-    rows,
-    templates,
-    usable,
-    doubt,
-    use,
-    images,
-    level,
-    stride,
-    masks,
-    use_mask,
-    P,
-    centers,
-    prior_X,
-    prior_Q,
-    prior_shift,
-    prior_turn,
-    iterations,
-    least_correlation,
-    correlation,
-    covariance,
-):
-    """Align patches with one level of a frame, in place.
-
-    Parameters
-    ----------
-    which : (A,) int
-        Patches to align.
-    X, Q : (N, 3), (N, 3, 3) float
-        Places at the start; replaced by those found.
-    shape : (N, M, 5) float
-    size : (N,) float
-        What a pixel covers on the patch, metres: the unit in which steps are limited.
-    rows : (N,) int
-        Where the patches have their templates.
-    templates : (R, C, L, M, 3) float32
-    usable : (R, C, M) uint8
-    doubt : (N, C) float
-        Standard deviation of the place at which each template was taken, metres.
-    use : (N, C) uint8
-        Cameras to align with.
-    images : (C, H, W) float32
-    level : int
-        Level of the templates.
-    stride : int
-        Use every so many of the samples; 2 is a chequerboard, enough for blurred images.
-    masks : (C, H, W) uint8
-    use_mask : bool
-        Whether samples outside the silhouettes are left out.
-    P, centers : (C, 3, 4), (C, 3) float
-    prior_X, prior_Q : (N, 3), (N, 3, 3) float
-        Where the patches are expected.
-    prior_shift, prior_turn : (N,) float
-        Standard deviations of that, metres and radians.
-    iterations : int
-        At most; 0 only compares.
-    least_correlation : float
-        Cameras below it are left out while better ones are there.
-    correlation : (N, C) float
-        Filled: correlation in each camera, −1 where it has no part.
-    covariance : (N, 6) float
-        Filled: variances of shift (m²) and turn (rad²) along the patch's own axes; NaN without solution.
-    """
-    for block in prange((len(which) + _TOGETHER - 1) // _TOGETHER):
-        _align_some(
-            which[block * _TOGETHER : (block + 1) * _TOGETHER],
-            X,
-            Q,
-            shape,
-            size,
-            rows,
-            templates,
-            usable,
-            doubt,
-            use,
-            images,
-            level,
-            stride,
-            masks,
-            use_mask,
-            P,
-            centers,
-            prior_X,
-            prior_Q,
-            prior_shift,
-            prior_turn,
-            iterations,
-            least_correlation,
-            correlation,
-            covariance,
-        )

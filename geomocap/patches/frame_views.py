@@ -152,7 +152,7 @@ class FrameViews:
         return (allowed != 0).all(axis=1)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _project(P: np.ndarray, points: np.ndarray, pixel: np.ndarray, depth: np.ndarray) -> None:
     """Project points (N, 3) with P (C, 3, 4) into `pixel` (N, C, 2), NaN behind a camera, and `depth` (N, C)."""
     for n in range(len(points)):
@@ -165,7 +165,7 @@ def _project(P: np.ndarray, points: np.ndarray, pixel: np.ndarray, depth: np.nda
                 pixel[n, c, i] = v / w if w > 0 else np.nan
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _look_up(pixel: np.ndarray, images: np.ndarray, values: np.ndarray) -> None:
     """Read images (C, H, W) at the nearest of their pixels into `values` (N, C); NaN outside and where infinite."""
     C, H, W = images.shape
@@ -183,18 +183,24 @@ def _reduced(views: PinholeViews, images: np.ndarray, factor: int) -> tuple[Pinh
     """Average `factor` × `factor` pixels of the subject; what is left over on the right and below is cut off."""
     C, H, W = views.masks.shape
     height, width = H // factor, W // factor
-    size, part = (width, height), (slice(height * factor), slice(width * factor))
     masks, valid = np.zeros((C, height, width), np.uint8), np.zeros((C, height, width), np.uint8)
     small = np.zeros((C, height, width, 3), np.uint8)
     for c in range(C):
-        fraction = cv2.resize(views.masks[c][part].astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        inside = images[c][part] * views.masks[c][part][:, :, None]
-        value = cv2.resize(inside.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        small[c] = np.rint(value / np.maximum(fraction, 1 / factor**2)[:, :, None]).clip(0, 255)
-        masks[c] = fraction >= 0.5
-        valid[c] = cv2.erode(views.valid[c][part], np.ones((factor, factor), np.uint8), anchor=(0, 0))[
-            ::factor, ::factor
-        ]
+        seen = views.valid[c][: height * factor, : width * factor]
+        valid[c] = np.minimum.reduce([seen[y::factor, x::factor] for y in range(factor) for x in range(factor)])
+        x, y, w, h = cv2.boundingRect(views.masks[c])
+        low, high = (y // factor, x // factor), (min(-(-(y + h) // factor), height), min(-(-(x + w) // factor), width))
+        rows, columns = high[0] - low[0], high[1] - low[1]
+        if min(w, h, rows, columns) <= 0:
+            continue
+        box = slice(low[0], high[0]), slice(low[1], high[1])
+        part = slice(low[0] * factor, high[0] * factor), slice(low[1] * factor, high[1] * factor)
+        inside = views.masks[c][part]
+        fraction = cv2.resize(inside.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
+        colored = (images[c][part] * inside[:, :, None]).astype(np.float32)
+        value = cv2.resize(colored, (columns, rows), interpolation=cv2.INTER_AREA)
+        small[(c, *box)] = np.rint(value / np.maximum(fraction, 1 / factor**2)[:, :, None]).clip(0, 255)
+        masks[(c, *box)] = fraction >= 0.5
     P = views.projections.copy()
     P[:, :2] /= factor
     return PinholeViews(views.names, P, masks & valid, valid), small

@@ -67,7 +67,7 @@ def lift_flow(view: FrameViews, positions: np.ndarray, flow: np.ndarray, neighbo
     return np.median(shift[enough[near]], axis=1)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _lift(P, pixel, depth, flow, known, shift):
     """Fill `shift` (N, 3) with what explains the `known` (N, C) image flow (N, C, 2) of points at `pixel`, `depth`.
 

@@ -11,7 +11,7 @@ from geomocap.patches.patch_templates import LEAST_SAMPLES, LEAST_VARIANCE
 _LEAST_FACING = 0.2  # cosine between normal and viewing ray below which a sample is not used
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def choose_samples(A, center, shape, template, usable, mask, use_mask, with_slopes, stride, places, J, T, moments):
     """Choose the samples of one camera and form their Jacobian, free of offset and gain.
 
@@ -70,7 +70,7 @@ def choose_samples(A, center, shape, template, usable, mask, use_mask, with_slop
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def compare(A, places, image, count, with_slopes, J, T, b, at, aside, below, values):
     """Sample the image: right side Σ J̃ I into `b`; returns its covariance with T and its variance.
 
@@ -107,7 +107,7 @@ def compare(A, places, image, count, with_slopes, J, T, b, at, aside, below, val
     return product / count, square / count - (total / count) ** 2
 
 
-@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER)
 def sum_of(a, count):
     """Sum of the first `count` of `a` (S,) float32, in double precision."""
     total = 0.0
@@ -116,7 +116,7 @@ def sum_of(a, count):
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER)
 def sum_of_products(a, b, count):
     """Sum of the first `count` products of `a` and `b` (S,) float32, in double precision."""
     total = 0.0

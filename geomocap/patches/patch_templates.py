@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 LEAST_SAMPLES = 0.6
 """Fraction of a template's samples that a camera must show for it to count."""
@@ -14,7 +14,7 @@ LEAST_VARIANCE = 0.5
 """Least variance of the grey levels under a patch."""
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def bilinear(image, x, y):
     """Interpolate an image at array indices x, y that must lie inside."""
     i, j = int(x), int(y)
@@ -24,7 +24,7 @@ def bilinear(image, x, y):
     return top * (1 - b) + low * b
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def local_camera(P, X, Q, A):
     """Projection of the patch's own coordinates: P [Q X; 0 1] into `A` (3, 4)."""
     for i in range(3):
@@ -33,7 +33,7 @@ def local_camera(P, X, Q, A):
         A[i, 3] = P[i, 0] * X[0] + P[i, 1] * X[1] + P[i, 2] * X[2] + P[i, 3]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def set_place(X, Q, new_X, new_Q):
     """Overwrite X (3,) and Q (3, 3)."""
     for i in range(3):
@@ -42,7 +42,7 @@ def set_place(X, Q, new_X, new_Q):
             Q[i, j] = new_Q[i, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def turn_by(Q, w0, w1, w2, out):
     """Q · exp([w]×) into `out`."""
     angle = math.sqrt(w0 * w0 + w1 * w1 + w2 * w2)
@@ -61,7 +61,7 @@ def turn_by(Q, w0, w1, w2, out):
         out[i, 2] = q0 * e02 + q1 * e12 + q2 * e22
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _take_template(n, X, Q, shape, rows, want, levels, masks, P, templates, usable):
     """Take the templates of patch n; parameters as of `take_templates`."""
     C = want.shape[1]
@@ -111,8 +111,8 @@ def _take_template(n, X, Q, shape, rows, want, levels, masks, P, templates, usab
             want[n, c] = 0
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def take_templates(X, Q, shape, rows, want, levels, masks, P, templates, usable):
+@njit(cache=True, nogil=True, error_model="numpy")
+def take_templates(begin, end, X, Q, shape, rows, want, levels, masks, P, templates, usable):
     """Take templates of patches in the cameras where `want` is 1.
 
     Parameters
@@ -133,5 +133,5 @@ def take_templates(X, Q, shape, rows, want, levels, masks, P, templates, usable)
     usable : (R, C, M) uint8
         Filled with 1 where the sample was seen.
     """
-    for n in prange(len(want)):
-        _take_template(np.int64(n), X, Q, shape, rows, want, levels, masks, P, templates, usable)
+    for n in range(begin, end):
+        _take_template(n, X, Q, shape, rows, want, levels, masks, P, templates, usable)

@@ -209,7 +209,7 @@ def _nearest_places(positions: np.ndarray, spacing: float) -> tuple[np.ndarray, 
     return low, cells
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def fill_cells(positions, low, edge, reach, cells, squared):
     """Let each cell know the nearest place whose distance from the cell's middle is below `reach`."""
     n = int(np.ceil(reach / edge))
@@ -226,7 +226,7 @@ def fill_cells(positions, low, edge, reach, cells, squared):
                         cells[i, j, k] = p
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def together(turns, shifts, X, Q, who, frames, alike, low, edge, cells, value):
     """How much m patches look like the places next to which K motions put them, on average: into `value` (K,).
 

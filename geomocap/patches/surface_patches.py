@@ -9,7 +9,9 @@ import numpy as np
 from geomocap.patches.alignment_kernel import align_patches
 from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.patch_templates import take_templates
+from geomocap.scheduling import spread
 
+_FEW = 32  # patches that are not worth waking other threads for
 _COARSE_STRIDE = 2  # of the samples, on blurred levels
 _OWN = ("positions", "frames", "shape", "size", "rows", "has", "hidden", "doubt")
 
@@ -202,7 +204,9 @@ def with_templates(patches: Patches, want: np.ndarray, view: FrameViews, sigma: 
     `sigma` (N,): standard deviation of their places, metres; 0 if not given, as where patches begin.
     """
     took = np.ascontiguousarray(want & ~patches.has, np.uint8)
-    take_templates(
+    spread(
+        take_templates,
+        len(took),
         patches.positions,
         patches.frames,
         patches.shape,
@@ -287,7 +291,9 @@ def align(
     for level, count in enumerate(iterations):
         if count < 0:
             continue
-        align_patches(
+        spread(
+            align_patches,
+            len(which),
             which,
             X,
             Q,
@@ -313,6 +319,7 @@ def align(
             least_correlation,
             correlation,
             covariance,
+            few=_FEW,
         )
     counted = correlation >= least_correlation
     part = correlation > -1

@@ -12,6 +12,7 @@ from typing import Any
 
 from geomocap.config import Config
 from geomocap.files.capture import Capture
+from geomocap.files.preview import PreviewCapture
 from geomocap.files.run import Run
 from geomocap.files.run_window import RunWindow
 from geomocap.files.scans import Scans
@@ -109,12 +110,14 @@ class Job:
             the same. By default all is written anew.
         """
         path = self.capture.path if self.capture is not None else self.scans.source if self.scans is not None else None
-        source = {
+        source: dict[str, Any] = {
             "kind": "capture" if self.capture is not None else "scans",
             "path": str(path),
             "fps": self.fps,
             "up": self.up,
         }
+        if isinstance(self.capture, PreviewCapture):
+            source["preview"] = self.capture.record
         self.run.claim()
         before = self._recorded(source) if tables else {}
         model = before.get("source", {}).get("model") if self.model is None else str(self.model)

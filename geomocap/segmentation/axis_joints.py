@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _inside(
     x: float, y: float, z: float, centers: np.ndarray, radii: np.ndarray, rotations: np.ndarray, k: int
 ) -> bool:
@@ -18,7 +18,7 @@ def _inside(
     return f <= 1.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def grow_joints(
     centers: np.ndarray, radii: np.ndarray, rotations: np.ndarray, pairs: np.ndarray, step: float
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _slot(key: int, table: np.ndarray) -> int:
     """Place of a key in an open hash table, or the free place where it belongs; the table's length is a power of 2."""
     mask = table.shape[0] - 1
@@ -16,7 +16,7 @@ def _slot(key: int, table: np.ndarray) -> int:
     return place
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def count_contacts(points: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
     """Count the neighbouring pairs of points between each two sets.
 

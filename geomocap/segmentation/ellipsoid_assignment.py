@@ -31,7 +31,7 @@ def assign(cost: np.ndarray, old: np.ndarray, new: np.ndarray, coherence: float)
     return assign_tree(np.take_along_axis(cost, candidates, axis=1), candidates, order, parent, old, new, coherence)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def assign_tree(
     cost: np.ndarray,
     candidates: np.ndarray,

@@ -46,7 +46,7 @@ class EllipsoidPaths:
     repaired: np.ndarray
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def halve(
     points: np.ndarray, order: np.ndarray, begin: np.ndarray, end: np.ndarray, moments: np.ndarray, k: int, count: int
 ) -> bool:

@@ -12,7 +12,7 @@ from geomocap.segmentation.ellipsoid_splitting import SplitFrame
 _NONE = 1e30
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _union_error(
     points: np.ndarray, starts: np.ndarray, after: np.ndarray, moments: np.ndarray, i: int, j: int, limit: float
 ) -> float:
@@ -33,7 +33,7 @@ def _union_error(
     return equivalent_length(total / m[0])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def merge_leaves(
     points: np.ndarray, starts: np.ndarray, moments: np.ndarray, contacts: np.ndarray, limit: float
 ) -> np.ndarray:

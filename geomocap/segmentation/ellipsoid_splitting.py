@@ -59,7 +59,7 @@ class SplitFrame:
         return np.repeat(np.arange(len(self.errors), dtype=np.int32), np.diff(self.starts))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _exceeds(
     points: np.ndarray, start: int, end: int, m: np.ndarray, variances: np.ndarray, axes: np.ndarray, limit: float
 ) -> bool:
@@ -73,7 +73,7 @@ def _exceeds(
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def split_points(
     points: np.ndarray, limit: float, max_depth: int, min_points: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -259,7 +259,7 @@ def _agreeing_mean(
     return total / count[..., None]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_agreeing(image, relit, plate, sigma, total, count):
     """Add a frame to the sum and the count of frames, where it agrees with the plate within 3 sigma in all channels.
 
@@ -284,7 +284,7 @@ def add_agreeing(image, relit, plate, sigma, total, count):
                 count[y, x] += np.float32(1.0)
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def agreement(stack, gains, offsets, reach, lit):
     """Find at each pixel the colour that the most frames agree on.
 
@@ -348,7 +348,7 @@ def agreement(stack, gains, offsets, reach, lit):
     return mean, support
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _shades(light, dark, limit):
     """Whether `dark` is `light` under a shadow: the same colour, times 0.3 to 0.95."""
     both = light[0] * dark[0] + light[1] * dark[1] + light[2] * dark[2]

@@ -10,7 +10,7 @@ EDGE = 12.0  # colour step that stops it, noise sigmas
 BAND = 64  # rows that are smoothed along x at once
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def background_misfit(image, mean, sigma, known, gain, offset):
     """Compare each pixel with the lit background: half the chi-square of the three channels.
 
@@ -43,7 +43,7 @@ def background_misfit(image, mean, sigma, known, gain, offset):
     return misfit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def smooth_evidence(evidence, image, sigma):
     """Let neighbours vote, but not across colour edges of the image.
 
@@ -91,14 +91,14 @@ def smooth_evidence(evidence, image, sigma):
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _vote(own, theirs, weights, a):
     """Move values (N,) to those of their neighbours, as far as the weights say."""
     for n in range(own.size):
         own[n] += a * weights[n] * (theirs[n] - own[n])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _edge_weights(image, sigma, right, down):
     """Fill in the weights to the pixels on the right, (H / BAND, W, BAND), and below, (H, W)."""
     h, w = sigma.shape

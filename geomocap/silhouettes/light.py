@@ -51,7 +51,7 @@ def light_change(
     return gain, offset
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _reweighted_line(x, y, sigma, gain, scale):
     """Line through (x, y) by Tukey's weights, from a first gain; scale shrinks to 1 sigma as it converges."""
     offset = 0.0

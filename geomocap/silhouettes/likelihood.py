@@ -204,7 +204,7 @@ def log_odds(
 LEAST = float(np.log(OUTLIER / 256.0**3))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _log_odds(image, sigma, known, texture, misfit, shade, subject, background, shadow, level, least):
     out = np.empty(known.shape, np.float32)
     for y in range(known.shape[0]):

@@ -256,7 +256,7 @@ def say(odds: np.ndarray) -> np.ndarray:
     return np.rint(STEPS * np.log(((1 - MISSED) * e + MISSED) / (CROSSED * e + 1 - CROSSED))).astype(np.int8)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def gather(P, says, beyond, origin, edge, volume):
     """Read what each camera says of each voxel's centre.
 
@@ -290,7 +290,7 @@ def gather(P, says, beyond, origin, edge, volume):
                             volume[c, i, j, k] = says[c, int(v), int(u)]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def best_on_rays(origin, rays, own, total, low, edge, enough):
     """Largest sum of what the other cameras say of a voxel on each ray.
 

@@ -9,7 +9,7 @@ REACH = 3  # pixels from which the colours on either side are taken
 CONTRAST = 3.0  # least difference of the two colours, in standard deviations of the subject's
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def refine_outline(mask, image, mean, known, sigma, gain, offset):
     """Decide the pixels on both sides of the outline by the subject's fraction of their colour.
 

@@ -57,7 +57,7 @@ def clean(mask: np.ndarray, evidence: np.ndarray, alike: float, smallest: float)
     return result
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def region_sums(labels, evidence, count):
     """Sum the evidence of labelled regions and count the pairs of neighbouring pixels across their borders.
 

@@ -71,7 +71,7 @@ def unexplained(views: PinholeViews, heeded: np.ndarray | None = None, blind: np
     return result
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def denied_rays(P, masks, valid, unseen, origin, rays, depths):
     """Tell which rays have no point that all cameras agree to, (N,) bool.
 

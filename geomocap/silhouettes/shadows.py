@@ -14,7 +14,7 @@ SHADOW_COLOR = 0.03  # how much a shadow may change colour, and brightness withi
 RING = 8  # rows that are kept at once; a power of two beyond the height of two windows
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def shadow_misfit(direct, image, mean, sigma, known, gain, offset, darkest):
     """Compare each pixel with the background under a shadow or reflection, where the lit background doesn't explain it.
 
@@ -108,7 +108,7 @@ def shadow_misfit(direct, image, mean, sigma, known, gain, offset, darkest):
     return result
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _light_row(image, mean, known, gain, offset, picture, lit, inner, values):
     """Fill in a row of the picture, of the lit background, of the channels' squares and of what is known, else 0."""
     for c in range(3):
@@ -123,7 +123,7 @@ def _light_row(image, mean, known, gain, offset, picture, lit, inner, values):
         seen[x] = known[x]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _sum_products(picture, lit, ib, bb):
     """Sum I·B and B² of a row over the channels."""
     i0, i1, i2 = picture[0], picture[1], picture[2]
@@ -133,7 +133,7 @@ def _sum_products(picture, lit, ib, bb):
         bb[x] = b0[x] * b0[x] + b1[x] * b1[x] + b2[x] * b2[x]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _sum_moments(b, n0, n1, n2):
     """Moments of a row of values (N + 4,) about each place: sums of b, b u and b u² over u = -2 … 2."""
     for x in range(n0.size):
@@ -144,14 +144,14 @@ def _sum_moments(b, n0, n1, n2):
         n2[x] = 4.0 * a0 + a1 + a3 + 4.0 * a4
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _sum_five(values, sums):
     """Sum each five values (N + 4,) of a row, (N,)."""
     for x in range(sums.size):
         sums[x] = values[x] + values[x + 1] + values[x + 2] + values[x + 3] + values[x + 4]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _may_be_shadow(picture, lit, ib, bb, noise, darkest, lightest, color, k, x):
     """Whether any factor at all explains this pixel."""
     factor = ib[k, x] / (bb[k, x] + np.float32(1e-6))
@@ -164,7 +164,7 @@ def _may_be_shadow(picture, lit, ib, bb, noise, darkest, lightest, color, k, x):
     return left <= HOPELESS
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fit_window(picture, lit, moments, squares, noise, radius, darkest, lightest, color, y, x, h, plane, tint, misfit):
     """Fit the shadow of the window around (y, x); leaves `misfit` infinite where it can't be one."""
     top, bottom = max(0, y - radius), min(h, y + radius + 1)

@@ -8,10 +8,10 @@ turns or shifts all bodies that hang on it by one and the same twist, so that th
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _add_block(block: np.ndarray, x: np.ndarray, y: np.ndarray, weight: np.ndarray, factor: float) -> None:
     """Add factor S(x)ᵀ W S(y) with S(x) = [-[x]×, I], 3 × 6."""
     x0, x1, x2 = x[0], x[1], x[2]
@@ -41,7 +41,7 @@ def _add_block(block: np.ndarray, x: np.ndarray, y: np.ndarray, weight: np.ndarr
             block[row, 5] += arm * w2
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _frame_equations(
     t,
     rotations,
@@ -138,8 +138,10 @@ def _frame_equations(
     costs[t] = cost
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def normal_equations(
+    begin,
+    end,
     rotations: np.ndarray,
     translations: np.ndarray,
     twists: np.ndarray,
@@ -188,9 +190,9 @@ def normal_equations(
     cost : (T,) float
         Filled: half the sum of cutoff² log(1 + χ² / cutoff²).
     """
-    for t in prange(len(rotations)):
+    for t in range(begin, end):
         _frame_equations(
-            np.int64(t),
+            t,
             rotations,
             translations,
             twists,

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
+from geomocap.scheduling import spread
 from geomocap.skeleton.adjustment_kernel import normal_equations
 from geomocap.skeleton.body_observations import Observations, SkinPoints
 from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, body_motion, moved_by
@@ -204,34 +204,32 @@ def _system(
     for low in range(0, frames, _CHUNK):
         some = slice(low, min(low + _CHUNK, frames))
         part = bodies.part(some)
-        threads = numba.get_num_threads()
         count = some.stop - some.start
-        numba.set_num_threads(threads if count > _FEW else 1)
         matrix, sides = np.zeros((count, size + shared, size + shared)), np.zeros((count, size + shared))
         costs = np.empty(count)
-        try:
-            normal_equations(
-                part.rotations,
-                part.translations,
-                _twists(linkage, motion.part(some), part, joint_prior is not None),
-                chain,
-                chain_start,
-                points.rest,
-                points.bodies,
-                points.fractions,
-                observations.start[some.start : some.stop + 1],
-                observations.point,
-                observations.target,
-                observations.normal,
-                observations.isotropic,
-                observations.across,
-                cutoff,
-                matrix,
-                sides,
-                costs,
-            )
-        finally:
-            numba.set_num_threads(threads)
+        spread(
+            normal_equations,
+            count,
+            part.rotations,
+            part.translations,
+            _twists(linkage, motion.part(some), part, joint_prior is not None),
+            chain,
+            chain_start,
+            points.rest,
+            points.bodies,
+            points.fractions,
+            observations.start[some.start : some.stop + 1],
+            observations.point,
+            observations.target,
+            observations.normal,
+            observations.isotropic,
+            observations.across,
+            cutoff,
+            matrix,
+            sides,
+            costs,
+            few=_FEW,
+        )
         blocks[some], border[some] = matrix[:, :size, :size], matrix[:, :size, size:]
         right[some] = sides[:, :size]
         corner += matrix[:, size:, size:].sum(axis=0)

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
+from geomocap.scheduling import spread
 from geomocap.skeleton.body_observations import INFLUENCES, SkinPoints
 from geomocap.skeleton.kinematics import BodyMotion, Linkage
 
@@ -40,7 +41,9 @@ def fit_fractions(
     count = bodies.rotations.shape[1]
     present = points.weights(count)
     fractions = np.zeros(present.shape)
-    _fit_fractions(
+    spread(
+        _fit_fractions,
+        len(points.rest),
         points.rest,
         np.ascontiguousarray(bodies.rotations),
         np.ascontiguousarray(bodies.translations),
@@ -73,7 +76,7 @@ def candidates_near(linkage: Linkage, points: SkinPoints) -> np.ndarray:
     return result
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fit_one(n, rest, rotations, translations, positions, weights, candidates, present, pull, result):
     """Fill the fractions of point n."""
     bodies = np.empty(candidates.shape[1], np.int64)
@@ -134,7 +137,7 @@ def _fit_one(n, rest, rotations, translations, positions, weights, candidates, p
         result[n, bodies[a]] = fraction[a]
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
-def _fit_fractions(rest, rotations, translations, positions, weights, candidates, present, pull, result):
-    for n in numba.prange(len(weights)):
-        _fit_one(np.int64(n), rest, rotations, translations, positions, weights, candidates, present, pull, result)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fit_fractions(begin, end, rest, rotations, translations, positions, weights, candidates, present, pull, result):
+    for n in range(begin, end):
+        _fit_one(n, rest, rotations, translations, positions, weights, candidates, present, pull, result)

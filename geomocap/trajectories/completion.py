@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.scheduling import spread
 
 _NEIGHBOURS = 12
 _CANDIDATES = 24
@@ -33,7 +34,7 @@ def nearest_companions(positions: np.ndarray, seen: np.ndarray, wanted: int) -> 
     pairs = np.unique(np.stack([np.concatenate(rows_list), np.concatenate(columns_list)], axis=1), axis=0)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     cost = np.empty(len(pairs))
-    _pair_costs(positions, seen, pairs[:, 0].copy(), pairs[:, 1].copy(), cost)
+    spread(_pair_costs, len(pairs), positions, seen, pairs[:, 0].copy(), pairs[:, 1].copy(), cost)
     order = np.lexsort((cost, pairs[:, 0]))
     pairs = pairs[order]
     first = np.searchsorted(pairs[:, 0], np.arange(count))
@@ -44,7 +45,7 @@ def nearest_companions(positions: np.ndarray, seen: np.ndarray, wanted: int) -> 
     return result
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _pair_cost(i, j, positions, seen):
     """Mean distance of two samples plus four times how much it varies; more where they are seldom seen together."""
     total, squares, common = 0.0, 0.0, 0
@@ -61,13 +62,13 @@ def _pair_cost(i, j, positions, seen):
     return (mean + 4.0 * spread) * (1.0 if common >= _LEAST_COMMON else 3.0)
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
-def _pair_costs(positions, seen, first, second, result):
-    for p in numba.prange(len(first)):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _pair_costs(begin, end, positions, seen, first, second, result):
+    for p in range(begin, end):
         result[p] = _pair_cost(first[p], second[p], positions, seen)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _carry_on(
     positions: np.ndarray,
     known: np.ndarray,

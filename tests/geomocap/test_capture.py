@@ -265,3 +265,16 @@ def test_fingerprint_notices_changed_images(tmp_path):
     assert before == capture.fingerprint("images")
     cv2.imwrite(str(tmp_path / "images/cam0/000000.png"), picture(2, 2))
     assert before != capture.fingerprint("images")
+
+
+@pytest.mark.parametrize(("kept", "most"), [(64e6, 5), (0, 16)])
+def test_a_video_read_backwards_keeps_what_it_decodes(tmp_path, monkeypatch, kept, most):
+    write_video(tmp_path / "cam0.mp4")  # 30 frames, a key frame in every eighth
+    video = Video(tmp_path / "cam0.mp4", kept)
+    forwards = [video.read(k) for k in range(30)]
+    opened, open_file = [], Video._open
+    monkeypatch.setattr(Video, "_open", lambda self: opened.append(self.path) or open_file(self))
+    for k in range(29, -1, -1):
+        np.testing.assert_array_equal(video.read(k), forwards[k])
+        assert len(video._recent) <= (4 if kept == 0 else 30)
+    assert len(opened) <= most

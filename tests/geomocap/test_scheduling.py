@@ -9,7 +9,7 @@ import cv2
 import numba
 import pytest
 
-from geomocap.scheduling import limit_threads, map_items, threads
+from geomocap.scheduling import limit_threads, map_items, spread, threads
 
 
 def test_results_come_in_order_and_progress_is_told():
@@ -44,6 +44,34 @@ def test_threads_share_the_cores():
     with threads(2) as executor:
         names = set(executor.map(lambda _: threading.current_thread().name, range(8)))
     assert 1 <= len(names) <= 2
+
+
+@pytest.mark.parametrize(("workers", "count", "few"), [(1, 100, 1), (3, 100, 1), (3, 2, 1), (3, 5, 8), (4, 0, 1)])
+def test_parts_of_a_kernels_work_are_all_done_once(monkeypatch, workers, count, few):
+    monkeypatch.setattr(numba, "get_num_threads", lambda: workers)
+    done, names = [], set()
+
+    def kernel(begin, end, offset):
+        names.add(threading.current_thread().name)
+        done.extend(offset + k for k in range(begin, end))
+
+    spread(kernel, count, 1000, few=few)
+    assert sorted(done) == [1000 + k for k in range(count)]
+    if workers == 1 or count <= few:
+        assert names <= {threading.current_thread().name}
+    else:
+        assert len(names) <= workers and threading.current_thread().name not in names
+
+
+def test_an_error_in_a_part_is_raised(monkeypatch):
+    monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
+
+    def kernel(begin, end):
+        if begin <= 7 < end:
+            raise ValueError("item 7")
+
+    with pytest.raises(ValueError, match="item 7"):
+        spread(kernel, 20)
 
 
 def test_a_limit_holds_for_executors_and_kernels_made_afterwards():

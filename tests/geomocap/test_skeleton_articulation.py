@@ -82,6 +82,8 @@ def test_kernel_agrees_with_the_sums_written_out():
     isotropic, across = rng.random((2, seen))
     matrix, right, cost = np.zeros((frames, unknowns, unknowns)), np.zeros((frames, unknowns)), np.empty(frames)
     normal_equations(
+        0,
+        frames,
         rotations,
         translations,
         twists,

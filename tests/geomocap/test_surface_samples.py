@@ -7,10 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from geomocap.bodies.connected_linkage import connected_linkage
 from geomocap.bodies.local_rotations import local_rotations, turn_distances
-from geomocap.bodies.rigid_motions import fit_rigid_motion
+from geomocap.bodies.rigid_motions import _step_equations, fit_rigid_motion
 from geomocap.bodies.skin_blending import explain
 from geomocap.bodies.surface_graph import bridges, lasting_distances, surface_graph
-from geomocap.model.motion_paths import sure_part
+from geomocap.model.motion_paths import DEPTH_FRACTION, sure_part
 from geomocap.model.rotations import turn_angles
 
 
@@ -117,6 +117,31 @@ def test_a_motion_with_rays_is_the_least_squares_one():
 
     found = np.concatenate([Rotation.from_matrix(rotations[2]).as_rotvec(), translations[2]])
     np.testing.assert_allclose(found, least_squares(misses, np.zeros(6), xtol=1e-12).x, atol=1e-6)
+
+
+def test_equations_of_a_motion_with_rays_are_those_of_their_jacobian():
+    rng = np.random.default_rng(12)
+    n, T = 7, 4
+    rotations = Rotation.from_rotvec(rng.normal(size=(T, 3))).as_matrix()
+    translations, positions = rng.normal(size=(T, 3)), rng.normal(size=(n, T, 3))
+    rest, weights, ray = rng.normal(size=(n, 3)), rng.random((n, T)), rng.normal(size=(n, T, 3))
+    ray /= np.linalg.norm(ray, axis=2, keepdims=True)
+    middle, normal, right = np.zeros((T, 3)), np.zeros((T, 6, 6)), np.zeros((T, 6))
+    for begin, end in ((0, 1), (1, 4)):
+        _step_equations(begin, end, rotations, translations, positions, rest, weights, ray, middle, normal, right)
+    for t in range(T):
+        turned = rest @ rotations[t].T
+        expected = np.average(turned, axis=0, weights=weights[:, t])
+        np.testing.assert_allclose(middle[t], expected, rtol=1e-12)
+        for k in range(n):
+            # a turn by w moves an arm a by w x a = -[a]x w
+            x, y, z = turned[k] - expected
+            J = np.hstack([-np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), np.eye(3)])
+            across = np.eye(3) - (1 - DEPTH_FRACTION**2) * np.outer(ray[k, t], ray[k, t])
+            normal[t] -= weights[k, t] * J.T @ across @ J
+            right[t] -= weights[k, t] * J.T @ across @ (positions[k, t] - turned[k] - translations[t])
+    np.testing.assert_allclose(normal, 0, atol=1e-12)
+    np.testing.assert_allclose(right, 0, atol=1e-12)
 
 
 def test_blends_with_rays_are_those_of_a_search():
