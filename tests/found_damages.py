@@ -13,4 +13,6 @@ FOUND: list[tuple[str, list[tuple[str, float, object]]]] = [
     # times next to each other, and places beyond all measure: their quotients and squares overflow
     ("trc", [("put", 0.8647493576945331, b"1e-320")]),
     ("trc", [("byte", 0.3114668067754849, 69)]),
+    # points without x, y, z
+    ("bodies.ply", [("drop", 0.09694369466585184, 52)]),
 ]
