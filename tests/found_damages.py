@@ -10,4 +10,9 @@ FOUND: list[tuple[str, list[tuple[str, float, object]]]] = [
     ("scan.npz", [("cut", 0.5, None), ("byte", 0.0, 0), ("double", 0.0, 67), ("drop", 0.0, 60)]),
     # a film in a code that libav has no decoder of
     ("video.webm", [("byte", 0.5, 0), ("double", 0.0, 107), ("byte", 0.25, 0)]),
+    # times next to each other, and places beyond all measure: their quotients and squares overflow
+    ("trc", [("put", 0.8647493576945331, b"1e-320")]),
+    ("trc", [("byte", 0.3114668067754849, 69)]),
+    # points without x, y, z
+    ("bodies.ply", [("drop", 0.09694369466585184, 52)]),
 ]

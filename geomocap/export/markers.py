@@ -16,6 +16,10 @@ from geomocap.model.skeleton import Skeleton
 LEAST_RESIDUAL = 0.0001  # m; 0 stands for points that were not measured
 
 
+FARTHEST = 1e9
+"""Metres from the origin beyond which nothing is measured; a number that is larger is damaged."""
+
+
 @dataclass(frozen=True)
 class Markers:
     """Named points in motion.
@@ -52,6 +56,10 @@ class Markers:
         if len(set(self.names)) < len(self.names):
             twice = next(n for n in self.names if self.names.count(n) > 1)
             raise MotionError(f"markers: two are called {twice}; give each its own name")
+        if (np.abs(self.positions) > FARTHEST).any():
+            frame, marker = np.argwhere((np.abs(self.positions) > FARTHEST).any(axis=2))[0]
+            far = np.abs(self.positions[frame, marker]).max()
+            raise MotionError(f"markers: {self.names[marker]} is {far:.3g} m away in frame {frame}; mend that number")
         if self.residuals is not None and self.residuals.shape != self.positions.shape[:2]:
             raise MotionError(
                 f"markers: residuals of shape {self.residuals.shape} for {self.positions.shape[:2]} points"

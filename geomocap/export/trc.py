@@ -114,8 +114,9 @@ def _rows(lines: list[str], n_markers: int, path: Path) -> tuple[np.ndarray, np.
 def _check_rate(times: np.ndarray, fps: float, path: Path) -> None:
     if len(times) < 2 or not np.isfinite(times).all():
         return
-    measured = (len(times) - 1) / (times[-1] - times[0]) if times[-1] > times[0] else np.inf
-    if abs(measured / fps - 1) > 0.01:
+    seconds, steps = times[-1] - times[0], len(times) - 1
+    if not 0.99 < seconds * fps / steps < 1.01:
+        measured = steps / seconds if seconds > 1e-9 else np.inf
         raise MotionError(
             f"{path}: DataRate says {fps:g} frames per second, the Time column {measured:g}; correct whichever is wrong"
         )

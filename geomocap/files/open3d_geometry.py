@@ -38,12 +38,15 @@ def read_by_open3d(read: Callable[[Path], T], path: Path) -> T:
     Raises
     ------
     GeometryError
-        If it is a PLY that isn't whole.
+        If it is a PLY that isn't whole, or nothing that Open3D makes sense of.
     """
     if path.suffix.lower() == ".ply":
         check_ply(path)
     with _alone, o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        return read(path)
+        try:
+            return read(path)
+        except RuntimeError:  # its words tell of its own sources
+            raise GeometryError(f"{path}: holds no points with x, y and z that can be read; make it again") from None
 
 
 def write_by_open3d(write: Callable[[Path, Any], bool], geometry: Any, size: int) -> Callable[[Path], bool]:
