@@ -50,6 +50,16 @@ def made_tracks(start, frames, count=6, seed=0):
     return Tracks(followed, PathDerivatives(speeds, 2 * speeds, speeds[..., 0], speeds[..., 0]))
 
 
+def joined_run(folder):
+    """A run of 44 frames in windows, whose trajectories are joined."""
+    whole, windows = Run(folder), windows_of(44, SMALL)
+    parts = [RunWindow.of(whole, w) for w in windows]
+    for part, window in zip(parts, windows, strict=True):
+        write_tracks(part, made_tracks(window.start, len(window)))
+    join_tracks(whole, parts, windows, 44)
+    return whole
+
+
 def test_tracks_of_windows_are_joined_and_read_as_those_of_the_whole(tmp_path):
     whole, frames = Run(tmp_path), 44
     windows = windows_of(frames, SMALL)
@@ -72,12 +82,7 @@ def test_tracks_of_windows_are_joined_and_read_as_those_of_the_whole(tmp_path):
 
 
 def test_tracks_are_read_frame_by_frame_in_either_layout(tmp_path):
-    whole = Run(tmp_path)
-    windows = windows_of(44, SMALL)
-    parts = [RunWindow.of(whole, w) for w in windows]
-    for part, window in zip(parts, windows, strict=True):
-        write_tracks(part, made_tracks(window.start, len(window)))
-    join_tracks(whole, parts, windows, 44)
+    whole = joined_run(tmp_path)
     found, spread = read_by_frame(whole), read_trajectories(whole)
     expected = TracksByFrame.of(spread)
     for name in ("who", "positions", "sigma", "begin", "count"):
@@ -90,12 +95,7 @@ def test_tracks_are_read_frame_by_frame_in_either_layout(tmp_path):
 
 
 def test_of_very_many_tracks_some_are_read(tmp_path, monkeypatch):
-    whole = Run(tmp_path)
-    windows = windows_of(44, SMALL)
-    parts = [RunWindow.of(whole, w) for w in windows]
-    for part, window in zip(parts, windows, strict=True):
-        write_tracks(part, made_tracks(window.start, len(window)))
-    join_tracks(whole, parts, windows, 44)
+    whole = joined_run(tmp_path)
     every = read_trajectories(whole).positions
     monkeypatch.setattr("geomocap.files.ragged_arrays.some_of.__defaults__", (44 * len(every) // 3,))
     assert_array_equal(read_trajectories(whole).positions, every[::3])
