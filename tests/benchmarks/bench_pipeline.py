@@ -30,8 +30,6 @@ def benchmark() -> list[Row]:
         _, few = _measure(short, root / "warm")  # compiles what is not compiled
         runs = [_measure(long, root / f"run{k}") for k in range(3)]
         seconds, many = median([r[0] for r in runs]), runs[-1][1]
-        _call(["run", str(long), str(root / "quick"), "--preview"])
-        preview = median([_call(["run", str(long), str(root / f"quick{k}"), "--preview"])[0] for k in range(3)])
         cold, warm = _first_use(root)
         stages = json.loads((root / "run2" / "timings.json").read_text())
     fractions = ", ".join(f"{name} {stage['seconds']:.1f} s" for name, stage in stages.items())
@@ -43,13 +41,6 @@ def benchmark() -> list[Row]:
             FRAMES / 15,
             "≤ 8 s after compilation, on 2 cores; flat memory",
             f"{fractions}; peak {many:.0f} MB, {few:.0f} MB with {FRAMES // 4} frames",
-        ),
-        Row(
-            "preview of the same, with report (geomocap run --preview)",
-            preview,
-            f"4 × the recording ({4 * FRAMES / 15:.1f} s)",
-            4 * FRAMES / 15,
-            "≤ 4 × the recording, on 2 cores",
         ),
         Row(
             "geomocap demo for the first time: what it takes longer than the next time, compilation",
@@ -70,13 +61,10 @@ def benchmark() -> list[Row]:
 
 
 def _first_use(root: Path) -> tuple[float, float]:
-    """Wall times of the demo with no kernel compiled, and with all of them: medians of three."""
-    times = []
-    for k in range(3):
-        cache = {"NUMBA_CACHE_DIR": str(root / f"kernels{k}")}
-        times.append([_call(["demo", str(root / f"demo{k}{n}")], cache)[0] for n in range(2)])
-    cold, warm = zip(*times, strict=True)
-    return median(cold), median(warm)
+    """Wall times of the demo with no kernel compiled, and with all of them."""
+    cache = {"NUMBA_CACHE_DIR": str(root / "kernels")}
+    cold, warm = (_call(["demo", str(root / name)], cache)[0] for name in ("first", "second"))
+    return cold, warm
 
 
 def _repeat(source: Path, target: Path, frames: int) -> Path:
