@@ -110,6 +110,11 @@ class PreviewCapture(Capture):
         assert self.whole is not None
         return self.whole
 
+    def _number(self, frame: int) -> int:
+        """Return which frame of the whole capture one is, also of a part of the preview."""
+        first = self._whole.first
+        return first % self.every + (self.first + frame) * self.every - first
+
     @property
     def record(self) -> dict[str, int]:
         """What `run.toml` says of it."""
@@ -130,11 +135,11 @@ class PreviewCapture(Capture):
 
     def mask_file(self, camera: str, frame: int) -> Path:
         """Return where a given silhouette is."""
-        return self._whole.mask_file(camera, frame * self.every)
+        return self._whole.mask_file(camera, self._number(frame))
 
     def mask(self, camera: str, frame: int) -> np.ndarray:
         """Read a given silhouette, reduced: (H, W) uint8, 0 or 255; raises as `Capture.mask`."""
-        mask = shrunk(self._whole.mask(camera, frame * self.every), self.sources[camera].size)
+        mask = shrunk(self._whole.mask(camera, self._number(frame)), self.sources[camera].size)
         return np.where(mask > 127, 255, 0).astype(np.uint8)
 
     def fingerprint(self, *parts: str) -> str:

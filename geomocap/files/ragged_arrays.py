@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-MOST_POSITIONS = 20_000_000  # of trajectories times frames that are spread at once; of more every k-th is taken
+# Of trajectories times frames that are spread at once, half a gigabyte of positions; of more every k-th is taken.
+MOST_POSITIONS = 20_000_000
 MOST_FRAMES = 10_000_000  # four days at 30 per second
 MOST_BYTES = 1 << 35  # of an array that is spread over all frames
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from contextlib import _GeneratorContextManager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -61,9 +61,11 @@ class RunWindow(Run):
         """Note files that a stage under way has finished, in the whole run's record."""
         Run(self.whole).note(stage, files)
 
-    def timed(self, stage: str) -> _GeneratorContextManager[dict[str, int]]:
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[dict[str, int]]:
         """Measure a stage into the whole run's `timings.json`."""
-        return Run(self.whole).timed(stage)
+        with Run(self.whole).timed(stage) as count:
+            yield count
 
 
 def write_poses(run: Run, rotations: np.ndarray, translations: np.ndarray, distance: np.ndarray) -> Path:

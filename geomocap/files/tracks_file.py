@@ -62,7 +62,8 @@ def join_tracks(run: Run, windows: Sequence[Run], frames: Sequence[range], n_fra
     n_frames : int
         Number of the recording's frames.
     """
-    lives = [_life(read_npz(w.path / TRACKS, ("start", "end"), ("start", "end"))) for w in windows]
+    names = ("start", "end")
+    lives = [(found["start"], found["end"]) for found in (read_npz(w.path / TRACKS, names, names) for w in windows)]
     lengths = [np.maximum(end - start + 1, 0) for start, end in lives]
     count, rows = sum(map(len, lengths)), int(sum(n.sum() for n in lengths))
 
@@ -86,10 +87,6 @@ def join_tracks(run: Run, windows: Sequence[Run], frames: Sequence[range], n_fra
     given = {"layout": np.array("ragged"), "first": first, "n_frames": np.array(n_frames), "reasons": np.array(REASONS)}
     arrays |= {name: (value.dtype, None, [value]) for name, value in given.items()}
     write_npz_parts(run.path / TRACKS, arrays)
-
-
-def _life(found: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    return found["start"], found["end"]
 
 
 def read_trajectories(run: Run) -> Trajectories:

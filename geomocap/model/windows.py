@@ -1,4 +1,4 @@
-"""Windows of a long recording: what is tracked and fitted at a time, so that memory doesn't grow with the length."""
+"""Windows of a long recording: what is tracked and fitted at a time, so that memory hardly grows with the length."""
 
 from __future__ import annotations
 
@@ -8,7 +8,12 @@ from geomocap.settings import Settings
 
 
 class WindowSettings(Settings):
-    """How a long recording is divided."""
+    """How a long recording is divided.
+
+    Two windows of up to 150 frames at once take about 2 GB (eight cameras, 320×240); of a man walking about, the core
+    index of the bodies is .98 then, of 60 frames .94. Velocities look at three frames on each side: the pose that is
+    handed over in the middle of twelve shared frames has as many in both windows. Other lengths weren't measured.
+    """
 
     frames: int = Field(150, ge=12, le=1_000_000, description="longest recording, or window of one, done in one piece")
     overlap: int = Field(12, ge=2, le=1000, description="frames that neighbouring windows share")
@@ -16,7 +21,7 @@ class WindowSettings(Settings):
     @model_validator(mode="after")
     def _overlap_within(self) -> WindowSettings:
         if 2 * self.overlap >= self.frames:
-            raise ValueError(f"overlap: {self.overlap} frames are half of a window of {self.frames} or more")
+            raise ValueError(f"overlap: {self.overlap} is half of {self.frames} frames or more; take less")
         return self
 
 

@@ -28,7 +28,7 @@ from geomocap.pipeline.derived import FROM_BODIES
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.path_choice import patch_paths, point_paths
 from geomocap.pipeline.track_stage import tracks
-from geomocap.pipeline.window_following import follow_windows, shows_most
+from geomocap.pipeline.window_following import follow_windows, shows_most, surfaces_of
 from geomocap.scheduling import map_items
 from geomocap.skeleton.kinematics import BodyMotion, posed, since
 from geomocap.subject.model_following import FollowedSequence, follow_model
@@ -80,21 +80,16 @@ def _follow(job: Job, geometry: Geometry, model: SubjectModel, windows: list[ran
         joint_axes=posed(model.linkage, followed.bodies, 0).axes,
     )
     write_diagnostics(job.run, made)
-    told = fit_warnings(model, followed, job.config.following.poor_fit)
+    told = _fit_warnings(model, followed, job.config.following.poor_fit)
     write_warnings(job.run, [*camera_warnings(job.run), *told])
     return frames
 
 
 def _follow_piece(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) -> FollowedSequence:
     """Look for a model in a recording, or a window of one, and follow it."""
-    features = geometry.features if len(model.colors) else None
-
-    def read(frame: int) -> tuple[np.ndarray, np.ndarray | None]:
-        return geometry.points(frame), None if features is None else features(frame)
-
     paths = patch_paths(read_trajectories(job.run)) if patches else point_paths(job, geometry)
-    settings, up = job.config.following, job.up_axis
-    return follow_model(model, read, len(geometry), geometry.spacing, up, paths, settings, job.progress)
+    read, settings = surfaces_of(geometry, model), job.config.following
+    return follow_model(model, read, len(geometry), geometry.spacing, job.up_axis, paths, settings, job.progress)
 
 
 def write_followed(job: Job, geometry: Geometry, model: SubjectModel, bodies: BodyMotion) -> None:
@@ -121,8 +116,7 @@ def model_skeleton(model: SubjectModel, bodies: BodyMotion, fps: float) -> Skele
     return replace(found, joint_names=model.joint_names, body_names=model.body_names)
 
 
-def fit_warnings(model: SubjectModel, followed: FollowedSequence, poor: float) -> list[str]:
-    """Say in words where a model's surface is farther from that of the sequence than `poor` (diagonals)."""
+def _fit_warnings(model: SubjectModel, followed: FollowedSequence, poor: float) -> list[str]:
     fraction = followed.distance / model.diagonal
     if float(np.median(fraction)) > poor:
         return [

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from geomocap.errors import GeometryError
 from geomocap.evaluation.result_check import model_overlap
 from geomocap.model.frame_geometry import Geometry
@@ -12,6 +10,7 @@ from geomocap.motion import Motion
 from geomocap.nodes.surface_coverage import SMALLEST_PIECE
 from geomocap.pipeline.following_stage import model_skeleton, write_followed
 from geomocap.pipeline.job import Job
+from geomocap.pipeline.window_following import surfaces_of
 from geomocap.skeleton.kinematics import Linkage, joint_motion, posed
 from geomocap.subject.model_following import fit_motion
 from geomocap.subject.subject_model import MODEL_FILE, read_model
@@ -32,15 +31,12 @@ def fit_unseen(job: Job, geometry: Geometry, motion: Motion, paths: MotionPaths)
     if job.capture is None or not path.is_file() or (motion.bodies.reliability > 0).all():
         return None
     model, found = read_model(path), motion.skeleton
-    features = geometry.features if len(model.colors) else None
-
-    def read(frame: int) -> tuple[np.ndarray, np.ndarray | None]:
-        return geometry.points(frame), None if features is None else features(frame)
-
     start = joint_motion(model.linkage, found.body_rotations, found.root_positions)
     try:
         with job.run.timed("fit") as count:
-            followed = fit_motion(model, start, read, geometry.spacing, paths, job.config.following, job.progress)
+            followed = fit_motion(
+                model, start, surfaces_of(geometry, model), geometry.spacing, paths, job.config.following, job.progress
+            )
             count["items"] = len(geometry)
     except GeometryError:  # a frame shows next to nothing of the subject
         return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +23,12 @@ from geomocap.subject.subject_model import SubjectModel
 from geomocap.subject.window_motion import joined_motion, pose_of
 
 _LOOKS = 12  # frames of a window whose shapes are compared
+
+
+def surfaces_of(geometry: Geometry, model: SubjectModel) -> Callable[[int], tuple[np.ndarray, np.ndarray | None]]:
+    """Return what reads a frame's points, and their colours if the model has some, as `follow_model` takes it."""
+    features = geometry.features if len(model.colors) else None
+    return lambda frame: (geometry.points(frame), None if features is None else features(frame))
 
 
 def shows_most(job: Job, geometry: Geometry, windows: Sequence[range]) -> int:
@@ -124,13 +130,9 @@ class _Chain:
 
     def _window(self, window: range, known: tuple[int, JointMotion]) -> FollowedSequence:
         geometry = GeometryPart(self.geometry, window)
-        features = geometry.features if len(self.model.colors) else None
-
-        def read(frame: int) -> tuple[np.ndarray, np.ndarray | None]:
-            return geometry.points(frame), None if features is None else features(frame)
-
         paths: MotionPaths | None = None
         if self.has_tracks:
             paths = patch_paths(read_trajectories(RunWindow.of(self.run, window)))
         model, spacing = self.model, geometry.spacing
+        read = surfaces_of(geometry, model)
         return follow_model(model, read, len(window), spacing, model.up, paths, self.settings, known=known)

@@ -118,6 +118,7 @@ def test_given_masks_are_reduced_and_stay_masks(tmp_path):
     assert mask.shape == (120, 160) and set(np.unique(mask)) == {0, 255}
     assert np.count_nonzero(mask.any(axis=1)) == 40
     assert preview.mask_file("cam1", 1).name == "000002.png"
+    assert preview.part(range(1, preview.n_frames)).mask_file("cam1", 0).name == "000002.png"
 
 
 def test_a_video_is_decoded_in_order(tmp_path, monkeypatch):

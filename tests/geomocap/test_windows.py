@@ -32,7 +32,7 @@ def test_windows_hold_all_frames_and_share_some(frames):
 
 
 def test_windows_must_be_longer_than_what_they_share():
-    with pytest.raises(SettingsError, match="overlap: 10 frames are half of a window of 20"):
+    with pytest.raises(SettingsError, match="overlap: 10 is half of 20 frames or more; take less"):
         load_settings(WindowSettings, None, {"frames": 20, "overlap": 10})
 
 
