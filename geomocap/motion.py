@@ -14,6 +14,7 @@ from geomocap.bodies.point_labels import label_points
 from geomocap.bodies.ray_depths import find_bodies_and_depths
 from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.outlines import Outlines
 from geomocap.model.skeleton import Skeleton
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.nodes.node_tracking import track_nodes
@@ -115,6 +116,7 @@ def find_motion(
     settings: MotionSettings | None = None,
     progress: Progress = silent,
     executor: Executor | None = None,
+    outlines: Outlines | None = None,
 ) -> Motion:
     """Find the rigid bodies that move a surface, their joints, and their motion.
 
@@ -137,6 +139,8 @@ def find_motion(
         Called with (stage, done, of).
     executor : Executor, optional
         Frames of scans are mapped with it.
+    outlines : Outlines, optional
+        Silhouettes of the cameras; of what one camera alone sees they tell how deep it lies.
 
     Returns
     -------
@@ -163,7 +167,7 @@ def find_motion(
         given, (paths, samples) = tracks, _sampled(tracks, sigma)
     else:
         paths = _followed(tracks, settings.nodes, progress, executor)
-    found, paths = find_bodies_and_depths(paths, settings.bodies, progress)
+    found, paths = find_bodies_and_depths(paths, settings.bodies, progress, outlines)
     progress("skeleton", 0, 2)
     connected = find_motion_skeleton(found, fps, settings.skeleton)
     progress("skeleton", 1, 2)

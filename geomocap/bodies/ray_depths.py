@@ -4,7 +4,8 @@ The image of one camera shows how a sample moves across its ray; how deep it lie
 volume, whose hull may stand off the surface by more than a limb is thick, in each frame by another length. So a trunk
 comes in pieces. But a sample keeps its place in a body: where the body turns, its path across the rays tells
 its depth, as in structure from motion (Tomasi, Kanade, Shape and motion from image streams under orthography, 1992),
-here body by body, and with the depths that the volume shows as a weak prior.
+here body by body, and with the depths that the volume shows as a weak prior. Where there are silhouettes, the volume is
+that which those of all frames leave of the body (`shape_across_time`).
 """
 
 from __future__ import annotations
@@ -18,12 +19,15 @@ from scipy.spatial import cKDTree
 from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.bodies.motion_bodies import MotionBodies, find_motion_bodies
 from geomocap.bodies.rigid_motions import fit_rigid_motion
+from geomocap.bodies.shape_across_time import hull_fronts
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.outlines import Outlines
 from geomocap.model.small_systems import solve_symmetric
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import spread
 
-_DEPTH_FRACTION = 0.05  # of what is missed along a ray, counts for a sample's place
+_DEPTH_FRACTION = 0.05  # of what is missed along a ray, counts for a sample's place;
+_FRONT_FRACTION = 0.3  # of what is missed of the hull of all frames: paths drift by a third of what that is wrong
 _ROUNDS = 2  # in which samples choose bodies and these move anew
 _EXPLAINED = 2.0  # median misses by which a body may miss a sample that it explains,
 _NEARLY_BEST = 1.5  # or so many times those of the body that explains it best
@@ -34,6 +38,8 @@ _CORE = 0.85  # fraction of one body that makes a sample tell its motion
 _LEAST = 6  # samples of a body
 _NOISE = 2e-4  # diagonals
 _REGULAR = 1e-9
+_REACH = 0.15  # diagonals; how far the front of a hull is looked for
+_STEP = 0.004  # diagonals
 _STAGE = "bodies"
 
 
@@ -56,13 +62,17 @@ class _RestPlaces:
 
 
 def find_bodies_and_depths(
-    paths: MotionPaths, settings: MotionBodiesSettings | None = None, progress: Progress = silent
+    paths: MotionPaths,
+    settings: MotionBodiesSettings | None = None,
+    progress: Progress = silent,
+    outlines: Outlines | None = None,
 ) -> tuple[MotionBodies, MotionPaths]:
     """Find bodies, from their motions the depths of what single cameras see, and bodies from these; again and again.
 
     Wrong depths make a surface that no rigid bodies move. So of the first bodies and those of `depth_rounds` further
-    rounds those are taken whose paths show the least noise, the latest of equals. Parameters and errors are those of
-    `find_motion_bodies`. Also returns the paths that the bodies are of.
+    rounds those are taken whose paths show the least noise, the latest of equals; with silhouettes, which tell depths
+    without bodies' help, the last. Parameters and errors are those of `find_motion_bodies`; `outlines` are those of
+    the cameras. Also returns the paths that the bodies are of.
     """
     settings = settings or MotionBodiesSettings()
     rounds = settings.depth_rounds if paths.ray is not None and paths.ray.any() else 0
@@ -71,15 +81,15 @@ def find_bodies_and_depths(
     progress(_STAGE, 1, 1 + rounds)
     best = bodies, paths
     for k in range(rounds):
-        paths = settle_depths(paths, bodies)
+        paths = settle_depths(paths, bodies, outlines)
         bodies = find_motion_bodies(paths, settings)
-        if bodies.noise <= best[0].noise:
+        if outlines is not None or bodies.noise <= best[0].noise:
             best = bodies, paths
         progress(_STAGE, 2 + k, 1 + rounds)
     return best
 
 
-def settle_depths(paths: MotionPaths, bodies: MotionBodies) -> MotionPaths:
+def settle_depths(paths: MotionPaths, bodies: MotionBodies, outlines: Outlines | None = None) -> MotionPaths:
     """Move positions along their rays to where the motion of a body carries them.
 
     Samples that mostly a single camera sees choose a body anew, for which hulls that are no surface may have lain in
@@ -93,6 +103,8 @@ def settle_depths(paths: MotionPaths, bodies: MotionBodies) -> MotionPaths:
         Without `ray` they are returned as they are.
     bodies : MotionBodies
         Found from these paths, or from these at other depths.
+    outlines : Outlines, optional
+        Silhouettes of the cameras that see them.
 
     Returns
     -------
@@ -104,13 +116,13 @@ def settle_depths(paths: MotionPaths, bodies: MotionBodies) -> MotionPaths:
     label, weights, rest = bodies.label.astype(int), bodies.weights, bodies.rest
     rotations, translations = bodies.rotations.swapaxes(0, 1), bodies.translations.swapaxes(0, 1)
     lone = (paths.ray.any(axis=2) & paths.seen).sum(axis=1) > 0.5 * paths.seen.sum(axis=1)
-    own = _blended(paths, weights, rotations, translations)
+    own = _blended(paths, weights, rotations, translations, outlines)
     for k in range(_ROUNDS):
-        chosen = _choose(paths, own, label, rest, rotations, translations)
+        chosen = _choose(paths, own, label, rest, rotations, translations, outlines)
         changed = lone & (chosen != label)
         label = np.where(changed, chosen, label)
         weights = np.where(changed[:, None], np.eye(len(rotations))[label], weights)
-        own = _blended(paths, weights, rotations, translations)
+        own = _blended(paths, weights, rotations, translations, outlines)
         if k < _ROUNDS - 1:
             rest = own.rest
             label, weights, rotations, translations = _refit(paths, own, label, weights, rotations, translations)
@@ -122,10 +134,16 @@ def _moved(paths: MotionPaths, places: _RestPlaces) -> np.ndarray:
     return paths.positions + places.depth[..., None] * paths.ray
 
 
-def _blended(paths: MotionPaths, weights: np.ndarray, rotations: np.ndarray, translations: np.ndarray) -> _RestPlaces:
+def _blended(
+    paths: MotionPaths,
+    weights: np.ndarray,
+    rotations: np.ndarray,
+    translations: np.ndarray,
+    outlines: Outlines | None,
+) -> _RestPlaces:
     """Places of samples that follow their bodies with given weights (N, B)."""
     turns = np.einsum("nb,btij->ntij", weights, rotations)
-    return _place(paths, turns, np.einsum("nb,bti->nti", weights, translations))
+    return _place(paths, turns, np.einsum("nb,bti->nti", weights, translations), outlines)
 
 
 def _choose(
@@ -135,6 +153,7 @@ def _choose(
     rest: np.ndarray,
     rotations: np.ndarray,
     translations: np.ndarray,
+    outlines: Outlines | None,
 ) -> np.ndarray:
     """Largest of the bodies that explain each sample, (N,) int; that which it has if there is none nearby."""
     assert paths.ray is not None
@@ -142,7 +161,7 @@ def _choose(
     misses = np.full((len(label), count), np.inf)
     alone = np.maximum((paths.ray.any(axis=2) & paths.seen).sum(axis=1), 1)
     for b in range(count):
-        found = _place(paths, rotations[b : b + 1], translations[b : b + 1])
+        found = _place(paths, rotations[b : b + 1], translations[b : b + 1], outlines)
         near = cKDTree(rest[label == b]).query(found.rest)[0] < _LOCAL * paths.diagonal
         before = found.depth.sum(axis=1) / alone < -_BEFORE * paths.diagonal
         misses[:, b] = np.where(near & ~before, found.miss, np.inf)
@@ -181,19 +200,32 @@ def _refit(
     return np.searchsorted(kept, label), weights, rotations[kept], translations[kept]
 
 
-def _place(paths: MotionPaths, rotations: np.ndarray, translations: np.ndarray) -> _RestPlaces:
-    """Find where samples lie at rest, if motions (N or 1, T, 3, 3), (N or 1, T, 3) carry them."""
+def _place(
+    paths: MotionPaths, rotations: np.ndarray, translations: np.ndarray, outlines: Outlines | None
+) -> _RestPlaces:
+    """Find where samples lie at rest, if motions (N or 1, T, 3, 3), (N or 1, T, 3) carry them.
+
+    With silhouettes their depths are not those of each frame's hull, but of the hull of all frames.
+    """
     assert paths.ray is not None
-    found = place_samples(
-        np.nan_to_num(paths.positions),
-        paths.seen,
-        np.ascontiguousarray(paths.ray, np.float64),
-        np.ascontiguousarray(rotations),
-        np.ascontiguousarray(translations),
-        _DEPTH_FRACTION,
-        _LARGEST * paths.diagonal,
-    )
-    return _RestPlaces(*found)
+    positions, ray = np.nan_to_num(paths.positions), np.ascontiguousarray(paths.ray, np.float64)
+    motions = np.ascontiguousarray(rotations), np.ascontiguousarray(translations)
+    diagonal = paths.diagonal
+    largest = _LARGEST * diagonal
+    found = _RestPlaces(*place_samples(positions, paths.seen, ray, *motions, _DEPTH_FRACTION, largest))
+    if outlines is None:
+        return found
+    seen_along = np.where(paths.seen[..., None], ray, 0.0)
+    inward = np.einsum("ntji,ntj->ni", np.broadcast_to(rotations, (*ray.shape, 3)), seen_along)
+    length = np.linalg.norm(inward, axis=1, keepdims=True)
+    inward /= np.where(length > 0, length, 1.0)
+    shift = hull_fronts(found.rest, inward, *motions, outlines, _STEP * diagonal, _REACH * diagonal)
+    front = found.rest + shift[:, None] * inward
+    carried = np.einsum("ntij,nj->nti", np.broadcast_to(rotations, (*ray.shape, 3)), front) + translations
+    deeper = np.where(paths.seen, ((carried - positions) * ray).sum(axis=2), 0.0)
+    moved = positions + deeper[..., None] * ray
+    again = _RestPlaces(*place_samples(moved, paths.seen, ray, *motions, _FRONT_FRACTION, largest))
+    return replace(again, depth=deeper + again.depth)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

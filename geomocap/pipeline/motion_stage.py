@@ -18,6 +18,7 @@ from geomocap.motion import Motion, MotionSettings, find_motion
 from geomocap.nodes.surface_coverage import SMALLEST_PIECE
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.motion_fit import fit_unseen
+from geomocap.pipeline.outline_reading import outlines_of
 from geomocap.pipeline.path_choice import motion_paths
 from geomocap.pipeline.subject_stage import make_model
 from geomocap.scheduling import map_items
@@ -35,8 +36,9 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
         bodies=config.motion_bodies, skeleton=config.motion_skeleton, refinement=config.refinement, nodes=config.nodes
     )
     with job.run.timed("motion") as count:
+        outlines = outlines_of(job) if any(paths.ray is not None for paths in choice.values()) else None
         found_from = {
-            source: find_motion(paths, fps=job.fps, settings=settings, progress=job.progress)
+            source: find_motion(paths, fps=job.fps, settings=settings, progress=job.progress, outlines=outlines)
             for source, paths in choice.items()
         }
         source = _best(job, found_from, geometry)

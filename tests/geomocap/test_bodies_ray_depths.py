@@ -150,7 +150,7 @@ def test_bodies_of_the_paths_with_the_least_noise_are_taken(monkeypatch, alone, 
         return found[-1][0]
 
     monkeypatch.setattr(ray_depths, "find_motion_bodies", find)
-    monkeypatch.setattr(ray_depths, "settle_depths", lambda paths, _: replace(paths))
+    monkeypatch.setattr(ray_depths, "settle_depths", lambda paths, *_: replace(paths))
     settings = MotionBodiesSettings(depth_rounds=3)
     best, paths = find_bodies_and_depths(alone, settings, lambda *step: reported.append(step))
     assert best is found[2][0] and paths is found[2][1]

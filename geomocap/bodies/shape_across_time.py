@@ -1,0 +1,113 @@
+"""Where the surface of bodies can be, if the silhouettes of all frames are those of one shape that moves.
+
+Few cameras leave a visual hull that stands off the surface wherever a limb is before or beside another one. But the
+limbs move: carried by the motion of its body, a place must be within the silhouettes of every frame. Four cameras and
+forty frames are a hundred and sixty views (Cheung, Baker, Kanade, Shape-from-silhouette across time, 2005).
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from geomocap.model.outlines import Outlines
+from geomocap.scheduling import spread
+
+_MAY_MISS = 0.05  # fraction of the views
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _misses(place, m, rotations, translations, frames, projections, empty, most):
+    """Number of silhouettes that a place at rest, carried by motion m, is outside of; not counted beyond `most`."""
+    K, C, H, W = empty.shape
+    count = 0
+    at = np.empty(3)
+    for k in range(K):
+        t = frames[k]
+        for r in range(3):
+            at[r] = translations[m, t, r]
+            for c in range(3):
+                at[r] += rotations[m, t, r, c] * place[c]
+        for c in range(C):
+            P = projections[c]
+            w = P[2, 0] * at[0] + P[2, 1] * at[1] + P[2, 2] * at[2] + P[2, 3]
+            if w <= 0:
+                continue
+            x = (P[0, 0] * at[0] + P[0, 1] * at[1] + P[0, 2] * at[2] + P[0, 3]) / w
+            y = (P[1, 0] * at[0] + P[1, 1] * at[1] + P[1, 2] * at[2] + P[1, 3]) / w
+            if x < -0.5 or y < -0.5 or x >= W - 0.5 or y >= H - 0.5:
+                continue
+            if empty[k, c, int(np.rint(y)), int(np.rint(x))]:
+                count += 1
+                if count > most:
+                    return count
+    return count
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fronts(begin, end, motion, rest, inward, rotations, translations, frames, views, steps, may_miss, shift):
+    projections, empty, step = views
+    allowed = int(may_miss * empty.shape[0] * empty.shape[1])
+    place, counts = np.empty(3), np.empty(2 * steps + 1, np.int64)
+    for i in range(begin, end):
+        least = empty.shape[0] * empty.shape[1]
+        for n in range(2 * steps + 1):
+            s = (n + 1) // 2 if n % 2 else -(n // 2)  # 0, 1, -1, 2, -2, …
+            for c in range(3):
+                place[c] = rest[i, c] + s * step * inward[i, c]
+            most = least + allowed
+            count = _misses(place, motion[i], rotations, translations, frames, projections, empty, most)
+            counts[steps + s] = count
+            least = min(least, count)
+        s = steps
+        if counts[s] > least + allowed:  # before the hull
+            while s < 2 * steps and counts[s] > least + allowed:
+                s += 1
+            if counts[s] > least + allowed:
+                continue
+        else:
+            while s > 0 and counts[s - 1] <= least + allowed:
+                s -= 1
+            if s == 0:
+                continue
+        shift[i] = (s - steps) * step
+
+
+def hull_fronts(
+    rest: np.ndarray,
+    inward: np.ndarray,
+    rotations: np.ndarray,
+    translations: np.ndarray,
+    outlines: Outlines,
+    step: float,
+    reach: float,
+    may_miss: float = _MAY_MISS,
+) -> np.ndarray:
+    """How far places are from the front of the hull that the silhouettes of all frames leave of their bodies.
+
+    Parameters
+    ----------
+    rest, inward : (N, 3) float
+        Places at rest, metres, and unit vectors away from what sees them.
+    rotations, translations : (N or 1, T, 3, 3), (N or 1, T, 3) float
+        Motions since rest of each place, or of all; rotations may be blends.
+    outlines : Outlines
+    step, reach : float, metres
+        Of the search along `inward`, to and fro.
+    may_miss : float
+        Fraction of the silhouettes that a place of the hull may be outside of, besides those that every place of its
+        line is outside of: these are at fault themselves, or the motion is.
+
+    Returns
+    -------
+    (N,) float, metres
+        To be gone along `inward`; 0 where no front is within reach.
+    """
+    shift = np.zeros(len(rest))
+    motion = np.arange(len(rest)) if len(rotations) > 1 else np.zeros(len(rest), np.int64)
+    views = np.ascontiguousarray(outlines.projections, np.float64), outlines.empty, float(step)
+    arrays = motion, np.ascontiguousarray(rest), np.ascontiguousarray(inward), np.ascontiguousarray(rotations)
+    frames = np.asarray(outlines.frames, np.int64)
+    work = *arrays, np.ascontiguousarray(translations), frames, views, int(np.ceil(reach / step)), may_miss, shift
+    spread(_fronts, len(rest), *work)
+    return shift

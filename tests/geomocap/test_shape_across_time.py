@@ -1,0 +1,125 @@
+"""Where the surface of bodies can be, if the silhouettes of all frames are those of one shape that moves."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from geomocap.bodies.shape_across_time import hull_fronts
+from geomocap.errors import GeometryError
+from geomocap.model.outlines import Outlines
+
+RADIUS, SIZE, FRAMES = 0.3, 160, 12
+STEP, REACH = 0.01, 0.5
+
+
+def cameras():
+    """Four cameras round the origin, 4 m away."""
+    result = []
+    for angle in np.deg2rad([0, 70, 140, 250]):
+        forward = -np.array([np.cos(angle), np.sin(angle), 0.0])
+        right = np.cross(forward, [0, 0, 1.0])
+        R = np.stack([right, np.cross(forward, right), forward])
+        K = np.array([[300.0, 0, SIZE / 2], [0, 300.0, SIZE / 2], [0, 0, 1]])
+        result.append(K @ np.concatenate([R, (-4.0 * R @ -forward)[:, None]], axis=1))
+    return np.array(result)
+
+
+def project(P, points):
+    w = points @ P[:, :, :3].swapaxes(1, 2) + P[:, None, :, 3]
+    return w[..., :2] / w[..., 2:]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A ball that a rod passes now and then, where every camera sees both as one silhouette, and its motion."""
+    P = cameras()
+    turns = Rotation.from_rotvec(np.linspace(0, 1.5, FRAMES)[:, None] * [0.2, 0.1, 1.0]).as_matrix()
+    shifts = np.linspace(0, 0.1, FRAMES)[:, None] * [1.0, 0.5, 0.2]
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(20_000, 3))
+    ball *= RADIUS * rng.random((len(ball), 1)) ** (1 / 3) / np.linalg.norm(ball, axis=1, keepdims=True)
+    empty = np.ones((FRAMES, len(P), SIZE, SIZE), np.uint8)
+    for t in range(FRAMES):
+        points = ball @ turns[t].T + shifts[t]
+        if t % 3 == 0:  # the rod
+            points = np.concatenate([points, rng.uniform([0.2, -0.1, -0.1], [0.7, 0.1, 0.1], (20_000, 3))])
+        for c, pixels in enumerate(np.rint(project(P, points)).astype(int)):
+            empty[t, c, pixels[:, 1], pixels[:, 0]] = 0
+    return Outlines(np.arange(FRAMES), P, empty), turns, shifts
+
+
+def on_the_ball(count=40):
+    """Places of the ball on the side of the rod, and the directions inward."""
+    rng = np.random.default_rng(1)
+    outward = rng.normal(size=(count, 3)) * 0.3 + [1.0, 0, 0]
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    return RADIUS * outward, -outward
+
+
+def reference(rest, inward, turns, shifts, outlines, step, reach, may_miss):
+    steps = int(np.ceil(reach / step))
+    s = np.arange(-steps, steps + 1)
+    allowed = int(may_miss * outlines.empty.shape[0] * outlines.empty.shape[1])
+    result = np.zeros(len(rest))
+    for i in range(len(rest)):
+        line = rest[i] + step * s[:, None] * inward[i]
+        counts = np.zeros(len(s), int)
+        for k, t in enumerate(outlines.frames):
+            pixels = np.rint(project(outlines.projections, line @ turns[t].T + shifts[t])).astype(int)
+            for c in range(len(pixels)):
+                x, y = pixels[c].T
+                inside = (x >= 0) & (y >= 0) & (x < SIZE) & (y < SIZE)
+                counts[inside] += outlines.empty[k, c, y[inside], x[inside]]
+        good = counts <= counts.min() + allowed
+        later = np.flatnonzero(good[steps:])
+        if not good[steps]:
+            result[i] = step * later[0] if len(later) else 0.0
+        else:
+            before = np.flatnonzero(~good[:steps])
+            result[i] = step * (before[-1] + 1 - steps) if len(before) else 0.0
+    return result
+
+
+def test_kernel_is_exact_against_numpy(scene):
+    outlines, turns, shifts = scene
+    rest, inward = on_the_ball()
+    for moved in (-0.2, 0.0, 0.15):
+        for may_miss in (0.0, 0.05):
+            args = rest + moved * inward, inward
+            found = hull_fronts(*args, turns[None], shifts[None], outlines, STEP, REACH, may_miss)
+            assert_allclose(found, reference(*args, turns, shifts, outlines, STEP, REACH, may_miss), atol=1e-12)
+
+
+def test_fronts_of_all_frames_are_the_surface_though_a_rod_is_before_it(scene):
+    outlines, turns, shifts = scene
+    rest, inward = on_the_ball()
+    for moved in (-0.3, -0.1, 0.1):  # before the surface, where the rod is, and within
+        shift = hull_fronts(rest + moved * inward, inward, turns[None], shifts[None], outlines, STEP, REACH)
+        assert np.median(np.abs(moved + shift)) < 0.025
+    still = Outlines(outlines.frames[:1], outlines.projections, outlines.empty[:1])
+    alone = hull_fronts(rest, inward, turns[None], shifts[None], still, STEP, REACH)
+    assert np.median(-alone) > 0.1  # the hull of one frame has the rod's depth
+
+
+def test_silhouettes_that_miss_the_subject_altogether_are_at_fault_themselves(scene):
+    outlines, turns, shifts = scene
+    rest, inward = on_the_ball()
+    empty = outlines.empty.copy()
+    empty[[1, 7, 9]] = 1
+    broken = Outlines(outlines.frames, outlines.projections, empty)
+    shift = hull_fronts(rest - 0.1 * inward, inward, turns[None], shifts[None], broken, STEP, REACH)
+    assert np.median(np.abs(shift - 0.1)) < 0.04
+
+
+def test_each_place_may_move_on_its_own(scene):
+    outlines, turns, shifts = scene
+    rest, inward = on_the_ball(8)
+    together = hull_fronts(rest, inward, turns[None], shifts[None], outlines, STEP, REACH)
+    every = np.repeat(turns[None], 8, axis=0), np.repeat(shifts[None], 8, axis=0)
+    assert_allclose(hull_fronts(rest, inward, *every, outlines, STEP, REACH), together, atol=0)
+
+
+def test_outlines_of_other_shapes_are_refused():
+    with pytest.raises(GeometryError, match="outlines: 2 frames"):
+        Outlines(np.arange(2), np.zeros((3, 3, 4)), np.zeros((2, 4, 5, 5), np.uint8))
