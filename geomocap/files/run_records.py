@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from geomocap.errors import RunError
-from geomocap.reading import harmless, read_json, read_toml, shortened
+from geomocap.reading import check_entries, harmless, read_json, read_toml, shortened
 
 RECORD, TIMINGS = "run.toml", "timings.json"
 _HINT = "delete it and run again"
@@ -50,6 +50,9 @@ def read_run_record(run: Path) -> dict[str, Any]:
     if not file.exists():
         raise RunError(f"{run}: no run folder, it has no {RECORD}")
     record = read_toml(file, RunError, _HINT)
+    check_entries(record, file, RunError, _HINT)
+    if "source" not in record:
+        raise RunError(f"{file}: cut off, it has no table source, as the record of a run has; {_HINT}")
     for name in _TABLES:
         if not isinstance(record.get(name, {}), dict):
             raise RunError(f"{file}: {name} is no table, as it is in the record of a run; {_HINT}")

@@ -128,8 +128,9 @@ class Job:
             {
                 "geomocap": {"version": __version__},
                 "source": source if model is None else {**source, "model": model},
-                "versions": {"python": platform.python_version(), **{p: version(p) for p in packages}},
                 "config": {k: table if k in tables else kept.get(k, table) for k, table in settings.items()},
+                # last: a text that is cut is no TOML, a number could be
+                "versions": {"python": platform.python_version(), **{p: version(p) for p in packages}},
             }
         )
 
