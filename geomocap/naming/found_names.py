@@ -7,7 +7,7 @@ the two sides are called a and b. What isn't known keeps its number.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -149,8 +149,7 @@ def _names(posture: MeanPosture, template: NameTemplate, ways: list[TreeMatch], 
         held: dict[frozenset[int], float] = defaultdict(float)
         for weight, region in zip(weights, regions, strict=True):
             held[region[body]] += float(weight)
-        parts, share = max(held.items(), key=lambda one: one[1])
-        likelihood = sum(w for p, w in held.items() if _unsided(p, template) == _unsided(parts, template))
+        parts, share, likelihood = likely_parts(held, template)
         if likelihood >= LIKELY and _in_place(places[body], parts, template):
             bodies[body] = parts, likelihood
             if _side(parts, template) and share < CERTAIN * likelihood:
@@ -182,16 +181,41 @@ def _names(posture: MeanPosture, template: NameTemplate, ways: list[TreeMatch], 
     )
 
 
+def likely_parts(held: Mapping[frozenset[int], float], template: NameTemplate) -> tuple[frozenset[int], float, float]:
+    """Return the parts in a body, and how likely they are: on these sides, and on either.
+
+    Where a limb was cut at one joint and it isn't sure which, what the body holds anyhow is told: "hand" of what may be
+    hand and forearm.
+
+    Parameters
+    ----------
+    held : mapping of set of parts to float
+        What the body may hold, and how likely that is.
+    template : NameTemplate
+    """
+    best = max(held.items(), key=lambda one: one[1])[0]
+    alike = sum(w for parts, w in held.items() if _unsided(parts, template) == _unsided(best, template))
+    if alike >= LIKELY:
+        return best, held[best], alike
+    has = {p: sum(w for parts, w in held.items() if template.parts[p] in _unsided(parts, template)) for p in best}
+    sure = frozenset(p for p in best if has[p] >= LIKELY)
+    if not sure:
+        return best, held[best], alike
+    other = frozenset(template.mirrored[p] for p in sure)
+    here = sum(w for parts, w in held.items() if sure <= parts)
+    return sure, here, sum(w for parts, w in held.items() if sure <= parts or other <= parts)
+
+
 def _in_place(place: np.ndarray, parts: frozenset[int], template: NameTemplate) -> bool:
     """Whether a body lies where its parts can be, and on their side; pieces of a wrong tree may not."""
     if not parts or not template.upright:
         return bool(parts)
     places, stray = part_places(template)
     mine = sorted(parts)
-    low, high = places[mine] - FAR * stray[mine], places[mine] + FAR * stray[mine]
+    between = np.clip(place, places[mine].min(axis=0), places[mine].max(axis=0))
     side = _side(parts, template)
-    inside = (place >= low.min(axis=0)).all() and (place <= high.max(axis=0)).all()
-    return bool(inside) and (not side or (place[1] > 0) == (side == "left"))
+    off = np.linalg.norm((place - between) / stray[mine].max(axis=0))
+    return bool(off <= FAR) and (not side or (place[1] > 0) == (side == "left"))
 
 
 def _likely_joint(

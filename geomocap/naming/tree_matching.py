@@ -70,7 +70,7 @@ def match_tree(posture: MeanPosture, template: NameTemplate, least: float = -np.
     """Match the joints of a posture to a template: the likeliest way, and others that are not much less likely.
 
     The others are the best ones with the subject facing another way, with left and right exchanged, and with one joint
-    each taken for something else.
+    each taken for something else, or for nothing that the template has.
 
     Parameters
     ----------
@@ -115,7 +115,8 @@ def match_tree(posture: MeanPosture, template: NameTemplate, least: float = -np.
     assert chosen is not None, "the best way above was one"
     for v in np.flatnonzero(chosen >= 0).tolist():
         part = int(chosen[v]) + 1
-        for barred in ([part], [part, int(template.mirrored[part])]):
+        nothing = list(range(1, len(template.parts)))
+        for barred in ([part], [part, int(template.mirrored[part])], nothing):
             without = gains.copy()
             without[np.ix_(found.joint == found.joint[v], np.array(barred) - 1)] = -np.inf
             other = _assign(found, model, without, best[1] - SURE - cue)

@@ -19,7 +19,7 @@ from geomocap.export.trc import read_trc
 from geomocap.files.run import Run
 from geomocap.model.skeleton import Skeleton
 from geomocap.naming.best_assignment import heaviest_choices
-from geomocap.naming.found_names import FoundNames, find_names
+from geomocap.naming.found_names import FoundNames, find_names, likely_parts
 from geomocap.naming.given_names import with_given
 from geomocap.naming.name_sets import renamed
 from geomocap.naming.name_templates import NamingError, built_in_templates, read_template
@@ -62,6 +62,22 @@ def test_joints_between_parts_in_one_body_are_told_as_missing():
     assert found.unparted == {"knee_right": "thigh_shank_right", "wrist_left": "forearm_hand_left"}
     assert renamed(found, "mixamo").unparted.keys() == found.unparted.keys()
     assert "# no knee_right: both its parts are in thigh_shank_right\n" in names_text(found)
+
+
+def test_what_a_body_holds_anyhow_is_told_where_its_joint_may_be_either():
+    def parts(*names):
+        return frozenset(
+            k for k, (part, side) in enumerate(zip(HUMAN.parts, HUMAN.sides, strict=True)) if f"{part}_{side}" in names
+        )
+
+    hand, lower, other = parts("hand_left"), parts("forearm_left", "hand_left"), parts("forearm_right", "hand_right")
+    assert likely_parts({hand: 0.8, lower: 0.2}, HUMAN) == (hand, 0.8, 0.8)
+    told, here, either = likely_parts({hand: 0.5, lower: 0.45, frozenset(): 0.05}, HUMAN)
+    assert told == hand and (here, either) == pytest.approx((0.95, 0.95))
+    told, here, either = likely_parts({hand: 0.4, lower: 0.3, other: 0.3}, HUMAN)
+    assert told == hand and (here, either) == pytest.approx((0.7, 1.0))  # which side isn't told then
+    told, here, _ = likely_parts({hand: 0.4, parts("foot_left"): 0.35, parts("head_"): 0.25}, HUMAN)
+    assert told == hand and here == 0.4  # too little for a name
 
 
 @pytest.mark.parametrize("template", [HUMAN, QUADRUPED, BIRD], ids=lambda t: t.name)
