@@ -139,8 +139,8 @@ def find_names(
 
 
 def _names(posture: MeanPosture, template: NameTemplate, ways: list[TreeMatch], scores: dict[str, float]) -> FoundNames:
-    weights = np.exp([way.score - ways[0].score for way in ways])
-    weights /= weights.sum()
+    weights = _shares([way.score + way.symmetry for way in ways])
+    apart = _shares([way.score for way in ways])  # that both sides are alike doesn't tell which is the left
     regions = [_regions(way, template) for way in ways]
     bodies: dict[int, tuple[frozenset[int], float]] = {}
     sides_known = True
@@ -149,10 +149,13 @@ def _names(posture: MeanPosture, template: NameTemplate, ways: list[TreeMatch], 
         held: dict[frozenset[int], float] = defaultdict(float)
         for weight, region in zip(weights, regions, strict=True):
             held[region[body]] += float(weight)
-        parts, share, likelihood = likely_parts(held, template)
+        parts, likelihood = likely_parts(held, template)
         if likelihood >= LIKELY and _in_place(places[body], parts, template):
             bodies[body] = parts, likelihood
-            if _side(parts, template) and share < CERTAIN * likelihood:
+            here = float(apart[[parts <= region[body] for region in regions]].sum())
+            other = frozenset(int(template.mirrored[p]) for p in parts)
+            there = float(apart[[other <= region[body] for region in regions]].sum())
+            if _side(parts, template) and here < CERTAIN * (here + there):
                 sides_known = False
     if not any(_side(parts, template) for parts, _ in bodies.values()):
         sides_known = False
@@ -181,8 +184,8 @@ def _names(posture: MeanPosture, template: NameTemplate, ways: list[TreeMatch], 
     )
 
 
-def likely_parts(held: Mapping[frozenset[int], float], template: NameTemplate) -> tuple[frozenset[int], float, float]:
-    """Return the parts in a body, and how likely they are: on these sides, and on either.
+def likely_parts(held: Mapping[frozenset[int], float], template: NameTemplate) -> tuple[frozenset[int], float]:
+    """Return the parts in a body, and how likely they are, on these sides or the others.
 
     Where a limb was cut at one joint and it isn't sure which, what the body holds anyhow is told: "hand" of what may be
     hand and forearm.
@@ -196,14 +199,17 @@ def likely_parts(held: Mapping[frozenset[int], float], template: NameTemplate) -
     best = max(held.items(), key=lambda one: one[1])[0]
     alike = sum(w for parts, w in held.items() if _unsided(parts, template) == _unsided(best, template))
     if alike >= LIKELY:
-        return best, held[best], alike
+        return best, alike
     has = {p: sum(w for parts, w in held.items() if template.parts[p] in _unsided(parts, template)) for p in best}
     sure = frozenset(p for p in best if has[p] >= LIKELY)
-    if not sure:
-        return best, held[best], alike
-    other = frozenset(template.mirrored[p] for p in sure)
-    here = sum(w for parts, w in held.items() if sure <= parts)
-    return sure, here, sum(w for parts, w in held.items() if sure <= parts or other <= parts)
+    other = frozenset(int(template.mirrored[p]) for p in sure)
+    return sure, sum(w for parts, w in held.items() if sure and (sure <= parts or other <= parts))
+
+
+def _shares(scores: Sequence[float]) -> np.ndarray:
+    """Likelihoods that add up to 1, of their logarithms."""
+    weights = np.exp(np.array(scores) - max(scores))
+    return weights / weights.sum()
 
 
 def _in_place(place: np.ndarray, parts: frozenset[int], template: NameTemplate) -> bool:
