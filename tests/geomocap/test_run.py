@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import numpy as np
 import open3d as o3d
@@ -13,6 +14,7 @@ from geomocap.errors import RunError, SettingsError
 from geomocap.files.atomic import write_atomic, write_text
 from geomocap.files.frame_files import read_voxels, write_voxels
 from geomocap.files.run import Run, stage_key
+from geomocap.files.run_records import source_path, source_places
 from geomocap.model.frame_geometry import Voxels
 
 HERE = "geomocap.files.run"
@@ -134,6 +136,23 @@ def test_a_record_cut_anywhere_is_refused(tmp_path):
         assert run.faults() == {"run.toml": f"cut ({length} of {len(data)} bytes)"}
     file.write_bytes(data)
     assert run.read_record() == whole and run.faults() == {}
+
+
+def test_the_source_is_found_from_anywhere_and_where_it_was_moved_with_the_run(tmp_path, monkeypatch):
+    capture, run = tmp_path / "a" / "capture", tmp_path / "a" / "runs" / "one"
+    capture.mkdir(parents=True)
+    run.mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    told = source_places(run, Path("a/capture"))
+    assert told == {"path": str(capture), "from_run": "../../capture"}
+    monkeypatch.chdir("/")
+    assert source_path(run, told) == capture
+    assert source_path(run, {"path": "a/capture"}) == capture  # as older runs say it
+    (tmp_path / "a").rename(tmp_path / "b")
+    moved = tmp_path / "b" / "runs" / "one"
+    assert source_path(moved, told).resolve() == tmp_path / "b" / "capture"
+    (tmp_path / "b" / "capture").rmdir()
+    assert source_path(moved, told) == capture  # named in what is said of it
 
 
 def test_settings_of_a_record_that_is_cut_off_are_refused(tmp_path):
