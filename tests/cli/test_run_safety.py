@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import random
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -135,3 +137,22 @@ def test_many_runs_in_one_process_hold_no_more(tmp_path):
     held = list(soak.soak(16, tmp_path))
     assert len({(h.files, h.threads) for h in held[4:]}) == 1
     assert soak.growth(held) < 0.5  # MB a run; nothing of a run's images or clouds may stay
+
+
+def test_a_process_that_is_asked_to_stop_says_one_line():
+    code = """
+import os, signal, time
+import geomocap.cli.app
+from geomocap.cli import main
+
+def work():
+    import geomocap.model.rig  # with COLMAP's library, which has a handler of its own
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(60)
+
+geomocap.cli.app.app = work
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 130
+    assert done.stderr == "geomocap: interrupted; start it again to go on from what is finished\n"
