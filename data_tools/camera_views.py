@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 from numba import njit
 
 from geomocap.errors import CalibrationError
+from geomocap.model.colmap_library import pycolmap
 from geomocap.model.rig import Rig
 
 

@@ -7,9 +7,9 @@ from typing import Literal
 
 import cv2
 import numpy as np
-import pycolmap
 
 from geomocap.errors import CalibrationError
+from geomocap.model.colmap_library import pycolmap
 
 SizeMismatch = Literal["auto", "crop-right", "center", "scale", "letterbox"]
 """How an image was made from the calibrated one: cut off at the right and below; cut (or padded) about its centre;

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pycolmap
 from scipy.spatial import ConvexHull, QhullError
 
 from data_tools.camera_views import framing_distance
+from geomocap.model.colmap_library import pycolmap
 from geomocap.model.rig import Rig
 
 

@@ -107,6 +107,23 @@ def parse_toml(text: str, path: Path | str, error: type[GeomocapError], hint: st
         raise error(f"{path}: not valid TOML ({reason(failed)}){after}") from None
 
 
+def check_entries(record: dict[str, Any], path: Path, error: type[GeomocapError], hint: str = "") -> None:
+    """Refuse a run's record with fewer values than it says (`geomocap.entries`): cut at a line's end, it is still TOML.
+
+    Records that don't say it, of older versions, pass, and so does what isn't a run's record.
+    """
+    own = record.get("geomocap")
+    said = own.get("entries") if isinstance(own, dict) else None
+    if type(said) is int and (there := count_values(record)) < said:
+        after = f"; {hint}" if hint else ""
+        raise error(f"{path}: cut off, it has {there} of the {said} values that geomocap.entries says{after}")
+
+
+def count_values(table: dict[str, Any]) -> int:
+    """Count the values in a table and those below it; an array is one."""
+    return sum(count_values(value) if isinstance(value, dict) else 1 for value in table.values())
+
+
 def read_json(path: Path, error: type[GeomocapError], hint: str = "delete it and run again") -> Any:
     """Read a JSON file; raises `error` if it can't be read or is none."""
     text = read_text(path, error, hint)

@@ -11,7 +11,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 from geomocap.errors import SettingsError
-from geomocap.reading import read_toml, shortened
+from geomocap.reading import check_entries, read_toml, shortened
 
 Model = TypeVar("Model", bound="Settings")
 MOST_COUNTED, MOST_MEASURED = 10_000_000, 1e9  # of any setting: things counted, and metres, pixels, degrees
@@ -144,6 +144,7 @@ def load_settings(model: type[Model], path: Path | None = None, overrides: dict[
     """
     values = {} if path is None else read_settings(path)
     if {"config", "geomocap"} <= values.keys() and isinstance(values["config"], dict):  # a run.toml
+        check_entries(values, path or Path(), SettingsError, "take another, or remove that line if it is meant so")
         values = values["config"]
     return check_settings(model, _merge(values, overrides or {}), str(path) if path is not None else "")
 

@@ -1,6 +1,7 @@
 """Ways to damage a file, and what reading it then must give.
 
-`python -m tests.damaged_files SECONDS [READER[,READER…] …]` fuzzes each for so much processor time.
+`python -m tests.damaged_files SECONDS [READER[,READER…] …]` fuzzes each for so much processor time; those with commas
+between share a process.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import faulthandler
 import os
 import re
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -111,30 +113,34 @@ def drawn(random: Random) -> list[tuple[str, float, object]]:
 
 @dataclass
 class Fuzzed:
-    """What came of fuzzing a reader: files read, kinds of answers, and the damages that broke it."""
+    """What came of fuzzing a reader: files, seconds of processor time, kinds of answers, and damages that broke it."""
 
     reader: Reader
     file: Path
     whole: bytes
+    random: Random
     count: int = 0
+    seconds: float = 0.0
     said: dict[str, list[tuple[str, float, object]]] = field(default_factory=dict)
     broken: dict[str, list[tuple[str, float, object]]] = field(default_factory=dict)
 
     @classmethod
-    def begin(cls, reader: Reader, folder: Path) -> Fuzzed:
+    def begin(cls, reader: Reader, folder: Path, random: Random) -> Fuzzed:
         """Make the reader's whole file, which must be read."""
         folder.mkdir()
         file = reader.make(folder)
         whole = file.read_bytes()
         assert survives(reader, file, whole) == ""
-        return cls(reader, file, whole)
+        return cls(reader, file, whole, random)
 
     def answer(self, done: list[tuple[str, float, object]]) -> str | None:
         """What is said of damages, numbers aside; None, and noted, if the reader breaks.
 
-        What takes over a minute ends the process, which then tells where it was.
+        What takes over a minute of processor time ends the process, which then tells where it was; so does what waits
+        for half an hour.
         """
-        faulthandler.dump_traceback_later(60, exit=True)
+        faulthandler.dump_traceback_later(1800, exit=True)
+        signal.setitimer(signal.ITIMER_PROF, 60)
         try:
             return re.sub(r"[-\d.e]+", "0", survives(self.reader, self.file, damaged(self.whole, done)))
         except Exception as error:  # all that is not one clear line is looked for
@@ -147,17 +153,20 @@ class Fuzzed:
                     traceback.print_exception(error, limit=-6)
             return None
         finally:
+            signal.setitimer(signal.ITIMER_PROF, 0)
             faulthandler.cancel_dump_traceback_later()
 
-    def go_on(self, random: Random, count: int) -> None:
-        """Damage the file so often; every third time more, from damages that gave an answer not heard before."""
-        for _ in range(count):
+    def go_on(self, seconds: float) -> None:
+        """Damage the file for so long; every third time more, from damages that gave an answer not heard before."""
+        begun, random = time.process_time(), self.random
+        while time.process_time() - begun < seconds:
             before = random.choice(list(self.said.values())) if self.said and random.random() < 1 / 3 else []
             done = [*before, *drawn(random)]
             said = self.answer(done)
             if said is not None and len(done) <= 12:
                 self.said.setdefault(said, done)
-        self.count += count
+            self.count += 1
+        self.seconds += time.process_time() - begun
 
     def smallest(self) -> list[list[tuple[str, float, object]]]:
         """The damages that broke the reader, less those that it breaks without."""
@@ -174,24 +183,23 @@ class Fuzzed:
 def fuzz(names: str, seconds: float, start: int = 0) -> int:
     """Damage the files of readers (commas between) in turns, from a seed on; return how many broke.
 
-    `seconds` are of processor time.
-
-    Tells how many files, how many kinds of answers, and the damages to be put into `tests.found_damages`. What takes
-    over 2 GB fails.
+    `seconds` are each reader's, of processor time. Tells how many files, how many kinds of answers, and the damages to
+    be put into `tests.found_damages`. What takes over 2 GB fails.
     """
-    random, begun, end = Random(start), time.monotonic(), time.process_time() + seconds
+    faulthandler.register(signal.SIGPROF, chain=True)
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(), at_most(2 << 30):
         warnings.simplefilter("error")
-        fuzzed = {n: Fuzzed.begin(READERS[n], Path(folder) / str(k)) for k, n in enumerate(names.split(","))}
-        while time.process_time() < end:
-            for one in fuzzed.values():
-                one.go_on(random, 100)
+        fuzzed = {
+            name: Fuzzed.begin(READERS[name], Path(folder) / str(k), Random(f"{start} {name}"))
+            for k, name in enumerate(names.split(","))
+        }
+        while (least := min(fuzzed.values(), key=lambda one: one.seconds)).seconds < seconds:
+            least.go_on(min(1.0, seconds - least.seconds))
         for name, one in fuzzed.items():
             for done in one.smallest():
                 print(f"BROKEN ({name!r}, {done!r}),", flush=True)  # noqa: T201
-            print(f"{name}: {one.count} damaged files, {len(one.said)} answers", flush=True)  # noqa: T201
-    took = time.monotonic() - begun
-    print(f"{names}: {seconds:.0f} s of processor time in {took:.0f} s, seed {start}", flush=True)  # noqa: T201
+            told = f"{one.count} damaged files, {len(one.said)} answers, {one.seconds:.0f} s of processor time"
+            print(f"{name}: {told}, seed {start}", flush=True)  # noqa: T201
     return sum(bool(one.broken) for one in fuzzed.values())
 
 
@@ -211,7 +219,7 @@ def main() -> int:
     """Fuzz readers, each in a process, or several in one; return how many processes found something."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("seconds", type=float)
-    parser.add_argument("reader", nargs="*", default=list(READERS), help="with commas between: they share the time")
+    parser.add_argument("reader", nargs="*", default=list(READERS), help="with commas between: they share a process")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     if len(options.reader) == 1:

@@ -98,7 +98,7 @@ _N, _T = 6, 5
 _RNG = np.random.default_rng(1)
 _TURNS = np.tile(np.eye(3), (_T, 2, 1, 1))
 
-_RECORD = '[source]\nkind = "capture"\npath = "a"\nfps = 30.0\nup = "z"\n[config]\na = 1\n'
+_RECORD = '[geomocap]\nentries = 6\n[source]\nkind = "capture"\npath = "a"\nfps = 30.0\nup = "z"\n[config]\na = 1\n'
 _STAGE = {"key": "k", "done": True, "outputs": ["b"], "files": {"b": [1, 2, 3]}}
 _TIMING = {"seconds": 1.5, "items": 3, "items_per_second": 2.0}
 

@@ -15,4 +15,6 @@ FOUND: list[tuple[str, list[tuple[str, float, object]]]] = [
     ("trc", [("byte", 0.3114668067754849, 69)]),
     # points without x, y, z
     ("bodies.ply", [("drop", 0.09694369466585184, 52)]),
+    # a scan of no components
+    ("jpg", [("zero", 0.375713640911547, 42)]),
 ]

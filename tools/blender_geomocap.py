@@ -62,6 +62,8 @@ def read_run(folder: Path) -> tuple[str, Path | None]:
     except (OSError, ValueError) as error:
         raise RunError(f"{folder / 'run.toml'}: can't be read ({error})") from None
     capture = Path(str(source.get("path", "")))
+    if "from_run" in source and not capture.exists():  # moved together with the run
+        capture = folder / str(source["from_run"])
     up = str(source.get("up", "z"))
     found = source.get("kind") == "capture" and (capture / "capture.toml").is_file()
     return (up if up in FROM_WORLD else "z"), (capture if found else None)

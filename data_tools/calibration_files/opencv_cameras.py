@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import pycolmap
 
 from geomocap.errors import CalibrationError
+from geomocap.model.colmap_library import pycolmap
 from geomocap.model.orientations import LONGEST_SIDE
 
 HALF_PIXEL = 0.5

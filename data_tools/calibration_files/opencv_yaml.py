@@ -13,7 +13,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pycolmap
 from scipy.spatial.transform import Rotation
 
 from data_tools.calibration_files.opencv_cameras import camera_from_opencv, camera_to_opencv
@@ -21,6 +20,7 @@ from data_tools.calibration_files.opencv_text import read_opencv_file
 from data_tools.calibration_files.plausibility import check_rig, check_size, in_metres, rotation_matrix
 from geomocap.errors import CalibrationError
 from geomocap.files.atomic import write_text
+from geomocap.model.colmap_library import pycolmap
 from geomocap.model.rig import Rig
 from geomocap.reading import harmless
 

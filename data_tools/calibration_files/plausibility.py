@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pycolmap
 
 from geomocap.errors import CalibrationError
+from geomocap.model.colmap_library import pycolmap
 from geomocap.model.orientations import nearest_rotation
 from geomocap.model.rig import Rig
 

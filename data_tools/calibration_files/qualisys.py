@@ -7,10 +7,10 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from data_tools.calibration_files.opencv_cameras import HALF_PIXEL
 from geomocap.errors import CalibrationError
+from geomocap.model.colmap_library import pycolmap
 from geomocap.model.orientations import LONGEST_SIDE, NOTED, nearest_rotation
 from geomocap.model.rig import Rig
 from geomocap.reading import read_text, reason

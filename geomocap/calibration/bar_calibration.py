@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from geomocap.calibration.bundle_adjustment import AdjustedNetwork
 from geomocap.calibration.calibration_quality import (
@@ -33,6 +32,7 @@ from geomocap.calibration.verdict import Verdict, judge
 from geomocap.calibration.world import WorldKnowledge
 from geomocap.errors import CalibrationError
 from geomocap.files.rigs import colmap_model, write_model
+from geomocap.model.colmap_library import pycolmap
 from geomocap.model.rig import Rig
 from geomocap.progress import Progress, silent
 

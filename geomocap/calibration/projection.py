@@ -12,10 +12,10 @@ The paper's differential scale is fx ≠ fy; its shear is the one here, in pixel
 from __future__ import annotations
 
 import numpy as np
-import pycolmap
 from numba import njit
 
 from geomocap.errors import CalibrationError
+from geomocap.model.colmap_library import pycolmap
 
 INTERIOR_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "shear")
 N_INTERIOR = 13

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import sys
+from contextlib import suppress
 
 GARBAGE = 100_000  # objects made before those not needed are looked for: compiling and importing make many that stay
 
@@ -17,6 +19,8 @@ def main() -> None:
 
     gc.set_threshold(GARBAGE)
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # what it stumbles over, the one line says
+    with suppress(ValueError):  # not the main thread
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # asked to stop, whoever asks
     try:
         app()
     except GeomocapError as error:

@@ -18,6 +18,7 @@ from geomocap.files.preview import preview_of
 from geomocap.files.results import read_cloud_record, read_warnings
 from geomocap.files.run import Run, stage_key
 from geomocap.files.run_lock import working_in
+from geomocap.files.run_records import source_path
 from geomocap.files.stage_records import listed_faults
 from geomocap.pipeline.camera_stage import agreeing, without_left_out
 from geomocap.pipeline.cloud_stage import measure_again
@@ -97,7 +98,7 @@ def capture_of(run: Run) -> Capture | None:
     if source.get("kind") != "capture" or "path" not in source:
         return None
     try:
-        whole = preview_of(Capture.open(Path(source["path"])), source.get("preview"))
+        whole = preview_of(Capture.open(source_path(run.path, source)), source.get("preview"))
         opened = without_left_out(whole, read_camera_doubts(run))
         return as_seen(run, opened)
     except GeomocapError as error:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from geomocap.angles.anatomical_frames import AnatomicalFrames
 from geomocap.export.conventions import GLB
 from geomocap.export.export_errors import MotionError
+from geomocap.export.limb_pieces import pieces_beside
 from geomocap.export.motion_tree import MotionTree
 from geomocap.export.skinned_mesh import SkinnedMesh, bone_mesh
 from geomocap.naming.found_names import FoundNames
@@ -38,7 +39,7 @@ def at_rest(
     """Return a motion whose nodes are not turned in a pose, and its mesh bound in that pose; bones without a mesh.
 
     Programs take the pose from the mesh. The motion itself stays the same. Bones of parts without a name keep their
-    place on their parents.
+    place on their parents, and named ones hang on named ones.
 
     Parameters
     ----------
@@ -67,6 +68,7 @@ def at_rest(
         offsets=np.einsum("nij,nj->ni", before, motion.offsets),
         tips=np.einsum("nij,nj->ni", turns, motion.tips),
     )
+    rested = pieces_beside(rested, found)
     return rested, rebound(bone_mesh(motion) if mesh is None else mesh, rested)
 
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import CalibrationError
+from geomocap.model.colmap_library import pycolmap
 from geomocap.reading import harmless, read_bytes, read_text, shortened
 
 MOST_MODEL = 1 << 30  # bytes of a file; images of big models list all their points

@@ -105,6 +105,8 @@ def _lookup(counts: np.ndarray, symbols: np.ndarray) -> np.ndarray:
 def _scan(picture: _Picture, head: bytes, data: bytes, at: int) -> tuple[int, str]:
     """Follow the codes of a scan; where the next marker is, and what is wrong."""
     count = head[0]
+    if not 1 <= count <= 4:
+        raise ValueError
     chosen = [(head[1 + 2 * k], head[2 + 2 * k] >> 4, head[2 + 2 * k] & 15) for k in range(count)]
     own_tables = all(dc in picture.tables and 16 + ac in picture.tables for _, dc, ac in chosen)
     if not (picture.baseline and own_tables and picture.height):

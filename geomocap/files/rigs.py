@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from geomocap.errors import CalibrationError
 from geomocap.files.atomic import write_folder
 from geomocap.files.colmap_model import read_colmap_model
+from geomocap.model.colmap_library import pycolmap
 from geomocap.model.orientations import NOTED
 from geomocap.model.rig import Rig
 from geomocap.reading import check_name

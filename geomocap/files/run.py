@@ -35,6 +35,7 @@ from geomocap.files.stage_records import (
     stages,
     write_record,
 )
+from geomocap.reading import count_values
 from geomocap.source_digest import module_digest
 from geomocap.version import __version__
 
@@ -253,8 +254,12 @@ class Run:
             raise RunError(f"{theirs}: is there, but not of a run in this folder; move it or choose another folder")
 
     def write_record(self, record: dict[str, Any]) -> None:
-        """Write `run.toml`: the configuration, the versions and the source."""
-        write_text(self.path / RECORD, tomli_w.dumps(record))
+        """Write `run.toml`: the configuration, the versions and the source; how many values tells it from a cut one."""
+        whole = {"geomocap": {**record.get("geomocap", {}), "entries": 0}}
+        whole |= {name: table for name, table in record.items() if name != "geomocap"}
+        whole["geomocap"]["entries"] = count_values(whole)
+        write_text(self.path / RECORD, tomli_w.dumps(whole))
+        self.renew("record", [self.path / RECORD])
 
     def read_record(self) -> dict[str, Any]:
         """Read `run.toml`.

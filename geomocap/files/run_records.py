@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from geomocap.errors import RunError
-from geomocap.reading import harmless, read_json, read_toml, shortened
+from geomocap.reading import check_entries, harmless, read_json, read_toml, shortened
 
 RECORD, TIMINGS = "run.toml", "timings.json"
 _HINT = "delete it and run again"
@@ -31,6 +32,7 @@ _EXPECTED: Mapping[tuple[str, str], tuple[Callable[[Any], bool], str]] = {
     ("geomocap", "version"): (_is_text, "a text"),
     ("source", "kind"): (_is_text, "a text"),
     ("source", "path"): (_is_text, "a path"),
+    ("source", "from_run"): (_is_text, "a path"),
     ("source", "model"): (_is_text, "a path"),
     ("source", "fps"): (_is_rate, "a number above 0"),
     ("source", "preview"): (_is_preview, "a table with every and longest, whole numbers above 0"),
@@ -50,6 +52,9 @@ def read_run_record(run: Path) -> dict[str, Any]:
     if not file.exists():
         raise RunError(f"{run}: no run folder, it has no {RECORD}")
     record = read_toml(file, RunError, _HINT)
+    check_entries(record, file, RunError, _HINT)
+    if "source" not in record:
+        raise RunError(f"{file}: cut off, it has no table source, as the record of a run has; {_HINT}")
     for name in _TABLES:
         if not isinstance(record.get(name, {}), dict):
             raise RunError(f"{file}: {name} is no table, as it is in the record of a run; {_HINT}")
@@ -58,6 +63,27 @@ def read_run_record(run: Path) -> dict[str, Any]:
             said = harmless(shortened(repr(value)))
             raise RunError(f"{file}: {table}.{key} is {said}; expected {expected}; {_HINT}")
     return record
+
+
+def source_places(run: Path, path: Path) -> dict[str, str]:
+    """Return what a run says of where its source is: from anywhere, and from the run, if both are moved together."""
+    return {"path": os.path.abspath(path), "from_run": os.path.relpath(path, run)}
+
+
+def source_path(run: Path, source: Mapping[str, Any]) -> Path:
+    """Return where a run's source is: where it was, or where it lies now as seen from the run.
+
+    Parameters
+    ----------
+    run : Path
+    source : mapping
+        The table of the run's record.
+    """
+    path = Path(source.get("path", ""))
+    moved = [run / source["from_run"]] if "from_run" in source else []
+    if not path.is_absolute():  # of older runs: from the folder where the command was given
+        moved += [parent / path for parent in run.absolute().parents]
+    return next((place for place in (path, *moved) if place.exists()), path)
 
 
 def read_timings(run: Path) -> dict[str, dict[str, float]]:

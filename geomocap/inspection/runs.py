@@ -22,6 +22,7 @@ from geomocap.files.results import (
     read_skeleton,
 )
 from geomocap.files.run import Run
+from geomocap.files.run_records import source_path
 from geomocap.inspection.description import Description, count, shortened
 from geomocap.subject.subject_model import MODEL_FILE, read_model
 
@@ -36,7 +37,7 @@ def describe_run(path: Path) -> Description:
         told.problem(error)
     source = record.get("source", {})
     if source:
-        told.fact("made from", f"{source.get('kind', '?')} {source.get('path', '?')}")
+        told.fact("made from", f"{source.get('kind', '?')} {source_path(path, source)}")
         told.fact("up", source.get("up", "z"))
     if "geomocap" in record:
         told.fact("version", record["geomocap"].get("version", "?"))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pycolmap
 
 from geomocap.errors import CalibrationError
+from geomocap.model.colmap_library import pycolmap
 
 EXACT = 1e-9  # a rotation that is orthonormal to this is taken as it is
 NOTED = 1e-5  # beyond, it is said that the nearest one was taken

@@ -10,9 +10,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
-import pycolmap
 
 from geomocap.errors import CalibrationError
+from geomocap.model.colmap_library import pycolmap
 from geomocap.model.orientations import EXACT, NOTED, check_camera, nearest_rotation
 from geomocap.reading import check_name
 

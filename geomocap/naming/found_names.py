@@ -7,7 +7,7 @@ the two sides are called a and b. What isn't known keeps its number.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -139,8 +139,8 @@ def find_names(
 
 
 def _names(posture: MeanPosture, template: NameTemplate, ways: list[TreeMatch], scores: dict[str, float]) -> FoundNames:
-    weights = np.exp([way.score - ways[0].score for way in ways])
-    weights /= weights.sum()
+    weights = _shares([way.score + way.symmetry for way in ways])
+    apart = _shares([way.score for way in ways])  # that both sides are alike doesn't tell which is the left
     regions = [_regions(way, template) for way in ways]
     bodies: dict[int, tuple[frozenset[int], float]] = {}
     sides_known = True
@@ -149,11 +149,13 @@ def _names(posture: MeanPosture, template: NameTemplate, ways: list[TreeMatch], 
         held: dict[frozenset[int], float] = defaultdict(float)
         for weight, region in zip(weights, regions, strict=True):
             held[region[body]] += float(weight)
-        parts, share = max(held.items(), key=lambda one: one[1])
-        likelihood = sum(w for p, w in held.items() if _unsided(p, template) == _unsided(parts, template))
+        parts, likelihood = likely_parts(held, template)
         if likelihood >= LIKELY and _in_place(places[body], parts, template):
             bodies[body] = parts, likelihood
-            if _side(parts, template) and share < CERTAIN * likelihood:
+            here = float(apart[[parts <= region[body] for region in regions]].sum())
+            other = frozenset(int(template.mirrored[p]) for p in parts)
+            there = float(apart[[other <= region[body] for region in regions]].sum())
+            if _side(parts, template) and here < CERTAIN * (here + there):
                 sides_known = False
     if not any(_side(parts, template) for parts, _ in bodies.values()):
         sides_known = False
@@ -182,16 +184,44 @@ def _names(posture: MeanPosture, template: NameTemplate, ways: list[TreeMatch], 
     )
 
 
+def likely_parts(held: Mapping[frozenset[int], float], template: NameTemplate) -> tuple[frozenset[int], float]:
+    """Return the parts in a body, and how likely they are, on these sides or the others.
+
+    Where a limb was cut at one joint and it isn't sure which, what the body holds anyhow is told: "hand" of what may be
+    hand and forearm.
+
+    Parameters
+    ----------
+    held : mapping of set of parts to float
+        What the body may hold, and how likely that is.
+    template : NameTemplate
+    """
+    best = max(held.items(), key=lambda one: one[1])[0]
+    alike = sum(w for parts, w in held.items() if _unsided(parts, template) == _unsided(best, template))
+    if alike >= LIKELY:
+        return best, alike
+    has = {p: sum(w for parts, w in held.items() if template.parts[p] in _unsided(parts, template)) for p in best}
+    sure = frozenset(p for p in best if has[p] >= LIKELY)
+    other = frozenset(int(template.mirrored[p]) for p in sure)
+    return sure, sum(w for parts, w in held.items() if sure and (sure <= parts or other <= parts))
+
+
+def _shares(scores: Sequence[float]) -> np.ndarray:
+    """Likelihoods that add up to 1, of their logarithms."""
+    weights = np.exp(np.array(scores) - max(scores))
+    return weights / weights.sum()
+
+
 def _in_place(place: np.ndarray, parts: frozenset[int], template: NameTemplate) -> bool:
     """Whether a body lies where its parts can be, and on their side; pieces of a wrong tree may not."""
     if not parts or not template.upright:
         return bool(parts)
     places, stray = part_places(template)
     mine = sorted(parts)
-    low, high = places[mine] - FAR * stray[mine], places[mine] + FAR * stray[mine]
+    between = np.clip(place, places[mine].min(axis=0), places[mine].max(axis=0))
     side = _side(parts, template)
-    inside = (place >= low.min(axis=0)).all() and (place <= high.max(axis=0)).all()
-    return bool(inside) and (not side or (place[1] > 0) == (side == "left"))
+    off = np.linalg.norm((place - between) / stray[mine].max(axis=0))
+    return bool(off <= FAR) and (not side or (place[1] > 0) == (side == "left"))
 
 
 def _likely_joint(

@@ -24,6 +24,7 @@ PLACE = 0.05  # how far subjects differ from a template, in shares of its longes
 SURFACE, REACH = 0.5, 0.25  # the same of logarithms
 LATERAL = 0.5  # of that to the sides: mean postures are nearly symmetric
 DEPENDENT = 0.5  # features of a joint overlap: their weight together
+ALIKE = 0.5  # share of what a subject's left differs from a template in that its right has, too (variances)
 SURE = 5.0  # log odds beyond which nobody asks
 TURNED = 4.0  # log odds of a motion that shows the heading clearly
 _TILTS = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])  # quarter turns
@@ -42,13 +43,16 @@ class TreeMatch:
     turn : (3, 3) float
         Template's axes, forward, left and up, from the posture's.
     score : float
-        Log likelihood ratio of the tree under the template against no template.
+        Log likelihood ratio of the tree under the template against no template, each joint for itself.
+    symmetry : float
+        What joints of left and right add to it by being alike.
     """
 
     joints: np.ndarray
     beyond: np.ndarray
     turn: np.ndarray
     score: float
+    symmetry: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,7 @@ def match_tree(posture: MeanPosture, template: NameTemplate, least: float = -np.
     """Match the joints of a posture to a template: the likeliest way, and others that are not much less likely.
 
     The others are the best ones with the subject facing another way, with left and right exchanged, and with one joint
-    each taken for something else.
+    each taken for something else, or for nothing that the template has.
 
     Parameters
     ----------
@@ -98,7 +102,7 @@ def match_tree(posture: MeanPosture, template: NameTemplate, least: float = -np.
         score = cue + _sum(gains, chosen)
         known = ways.get(chosen.tobytes())
         if np.isfinite(score) and (known is None or known.score < score):
-            ways[chosen.tobytes()] = _match(found, chosen, turn, score)
+            ways[chosen.tobytes()] = _match(found, chosen, turn, score, _symmetry(found, model, turn, chosen))
 
     best = -1, least + SURE
     for i, (bound, cue, turn, gains) in enumerate(tries):
@@ -115,7 +119,8 @@ def match_tree(posture: MeanPosture, template: NameTemplate, least: float = -np.
     assert chosen is not None, "the best way above was one"
     for v in np.flatnonzero(chosen >= 0).tolist():
         part = int(chosen[v]) + 1
-        for barred in ([part], [part, int(template.mirrored[part])]):
+        nothing = list(range(1, len(template.parts)))
+        for barred in ([part], [part, int(template.mirrored[part])], nothing):
             without = gains.copy()
             without[np.ix_(found.joint == found.joint[v], np.array(barred) - 1)] = -np.inf
             other = _assign(found, model, without, best[1] - SURE - cue)
@@ -124,7 +129,7 @@ def match_tree(posture: MeanPosture, template: NameTemplate, least: float = -np.
     exchanged = np.where(chosen >= 0, template.mirrored[np.maximum(chosen, 0) + 1] - 1, -1)
     for _, cue, turn, gains in tries:
         keep(exchanged, cue, turn, gains)
-    return sorted(ways.values(), key=lambda way: -way.score)
+    return sorted(ways.values(), key=lambda way: -way.score - way.symmetry)
 
 
 def decoy_score(posture: MeanPosture, template: NameTemplate, least: float) -> float:
@@ -205,12 +210,12 @@ def body_places(posture: MeanPosture, turn: np.ndarray) -> np.ndarray:
     return (tree.centers - tree.surfaces @ tree.centers) @ turn.T / diameter
 
 
-def _match(found: JointFeatures, chosen: np.ndarray, turn: np.ndarray, score: float) -> TreeMatch:
+def _match(found: JointFeatures, chosen: np.ndarray, turn: np.ndarray, score: float, symmetry: float) -> TreeMatch:
     count = len(chosen) // 2
     parts, beyond = np.full(count, -1), found.beyond[:count].copy()
     for v in np.flatnonzero(chosen >= 0).tolist():
         parts[found.joint[v]], beyond[found.joint[v]] = chosen[v] + 1, found.beyond[v]
-    return TreeMatch(parts, beyond, turn, score)
+    return TreeMatch(parts, beyond, turn, score, symmetry)
 
 
 def _turns(template: NameTemplate) -> Iterator[np.ndarray]:
@@ -250,24 +255,51 @@ def _template_model(template: NameTemplate) -> _Model:
 
 def _gains(found: JointFeatures, model: _Model, turn: np.ndarray) -> np.ndarray:
     """Log likelihood ratios, (V, K - 1), of found joints as joints of a template turned some way."""
-    known = model.features
-    gains = _ratio(found.surface[:, None] - known.surface, SURFACE, np.log(100))
-    gains += _ratio(found.reach[:, None] - known.reach, REACH, np.log(20))
-    place = found.place @ turn.T
-    center = found.center @ turn.T
-    for axis, share in enumerate((1.0, LATERAL, 1.0)):
-        gains += _ratio(place[:, None, axis] - known.place[:, axis], share * model.place, 1.0)
-        gains += _ratio(center[:, None, axis] - known.center[:, axis], share * model.center, 1.0)
-    gains *= DEPENDENT
+    errors, spreads, widths = _errors(found, model, turn)
+    gains = (np.log(widths / (np.sqrt(2 * np.pi) * spreads)) - 0.5 * errors**2).sum(axis=-1) * DEPENDENT
     if model.template.upright:  # what hangs on a joint of the left lies to the left of the middle
-        lateral = (place + center)[:, 1, None]
+        lateral = ((found.place + found.center) @ turn.T)[:, 1, None]
         gains[lateral * model.side < 0] = -np.inf
     return gains
 
 
-def _ratio(error: np.ndarray, spread: np.ndarray | float, width: float) -> np.ndarray:
-    """Log of a normal density against an even one over a width."""
-    return np.log(width / (np.sqrt(2 * np.pi) * spread)) - 0.5 * (error / spread) ** 2
+def _errors(found: JointFeatures, model: _Model, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Errors of eight features in their standard deviations, (V, K - 1, 8), these, (K - 1, 8), and widths to choose in.
+
+    The last six are the joint's place and the centre beyond it, forward, left and up.
+    """
+    known = model.features
+    errors = np.concatenate(
+        [
+            (found.surface[:, None] - known.surface)[..., None],
+            (found.reach[:, None] - known.reach)[..., None],
+            (found.place @ turn.T)[:, None] - known.place,
+            (found.center @ turn.T)[:, None] - known.center,
+        ],
+        axis=-1,
+    )
+    axes = np.array([1.0, LATERAL, 1.0])
+    like = np.ones_like(model.place)[:, None]
+    spreads = np.hstack([SURFACE * like, REACH * like, model.place[:, None] * axes, model.center[:, None] * axes])
+    return errors / spreads, spreads, np.array([np.log(100), np.log(20), 1, 1, 1, 1, 1, 1])
+
+
+def _symmetry(found: JointFeatures, model: _Model, turn: np.ndarray, chosen: np.ndarray) -> float:
+    """Log likelihood ratio of joints of the left and right that differ from the template alike.
+
+    Of two normal variables that share a part of their variance, against two that don't.
+    """
+    view = {int(part): v for v, part in enumerate(chosen.tolist()) if part >= 0}
+    mirrored = model.template.mirrored[1:] - 1
+    pairs = [(k, int(mirrored[k])) for k in view if model.side[k] > 0 and int(mirrored[k]) in view]
+    if not pairs:
+        return 0.0
+    errors, _, _ = _errors(found, model, turn)
+    a = np.array([errors[view[left], left] for left, _ in pairs])
+    b = np.array([errors[view[right], right] for _, right in pairs]) * [1, 1, 1, -1, 1, 1, -1, 1]
+    rest = 1 - ALIKE**2
+    apart = a**2 + b**2
+    return DEPENDENT * float((0.5 * apart - (apart - 2 * ALIKE * a * b) / (2 * rest) - 0.5 * np.log(rest)).sum())
 
 
 def _best_by_joint(gains: np.ndarray) -> np.ndarray:

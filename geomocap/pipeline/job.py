@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
@@ -14,6 +15,7 @@ from geomocap.config import Config
 from geomocap.files.capture import Capture
 from geomocap.files.preview import PreviewCapture
 from geomocap.files.run import Run
+from geomocap.files.run_records import source_path, source_places
 from geomocap.files.run_window import RunWindow
 from geomocap.files.scans import Scans
 from geomocap.files.stage_records import listed_faults
@@ -112,7 +114,7 @@ class Job:
         path = self.capture.path if self.capture is not None else self.scans.source if self.scans is not None else None
         source: dict[str, Any] = {
             "kind": "capture" if self.capture is not None else "scans",
-            "path": str(path),
+            **({} if path is None else source_places(self.run.path, path)),
             "fps": self.fps,
             "up": self.up,
         }
@@ -120,7 +122,7 @@ class Job:
             source["preview"] = self.capture.record
         self.run.claim()
         before = self._recorded(source) if tables else {}
-        model = before.get("source", {}).get("model") if self.model is None else str(self.model)
+        model = before.get("source", {}).get("model") if self.model is None else os.path.abspath(self.model)
         kept = before.get("config", {})
         settings = self.config.model_dump(mode="json", exclude_none=True)
         packages = ("numpy", "scipy", "numba", "open3d", "opencv-python-headless", "pycolmap", "trimesh")
@@ -128,17 +130,18 @@ class Job:
             {
                 "geomocap": {"version": __version__},
                 "source": source if model is None else {**source, "model": model},
-                "versions": {"python": platform.python_version(), **{p: version(p) for p in packages}},
                 "config": {k: table if k in tables else kept.get(k, table) for k, table in settings.items()},
+                # last: a text that is cut is no TOML, a number could be
+                "versions": {"python": platform.python_version(), **{p: version(p) for p in packages}},
             }
         )
 
     def _recorded(self, source: dict[str, Any]) -> dict[str, Any]:
         """Read the run's record; empty if there is none of this source."""
         record = self.run.read_record() if (self.run.path / "run.toml").is_file() else {}
-        kind, path = (record.get("source", {}).get(k, "") for k in ("kind", "path"))
-        same = kind == source["kind"] and Path(path).resolve() == Path(source["path"]).resolve()
-        return record if same else {}
+        before = record.get("source", {})
+        there = source_path(self.run.path, before).resolve() == Path(source.get("path", "")).resolve()
+        return record if there and before.get("kind", "") == source["kind"] else {}
 
     @property
     def up(self) -> str:

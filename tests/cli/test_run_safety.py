@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import random
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -67,7 +69,8 @@ def test_no_room_at_any_stage_then_room(whole, tiny, tmp_path):
     run, stopped = tmp_path / "run", set[str]()
     sizes = sorted({p.stat().st_size for p in whole.rglob("*") if p.is_file()} - {0})
     complete = content(whole)
-    for size in sizes[::3]:
+    named = ["run.toml", "voxels/000000.ply", "tracks.npz", "motion.glb"]
+    for size in sorted({*sizes[::4], *((whole / name).stat().st_size for name in named)}):
         with no_file_beyond(size - 1):
             status, told = run_tiny(tiny, run)
         if status == 0:
@@ -78,7 +81,7 @@ def test_no_room_at_any_stage_then_room(whole, tiny, tmp_path):
         there = {n: data for n, data in content(run).items() if n in complete and n in digests(run)}
         assert all(data == complete[n] for n, data in there.items()), "half a file"
         assert not list(run.rglob(".geomocap-*"))
-    assert {"run.toml", "voxels", "tracks.npz", "motion.glb"} <= stopped
+    assert {name.split("/")[0] for name in named} <= stopped
     status, told = run_tiny(tiny, run)
     assert status == 0, told
     assert digests(run) == digests(whole)
@@ -134,3 +137,22 @@ def test_many_runs_in_one_process_hold_no_more(tmp_path):
     held = list(soak.soak(16, tmp_path))
     assert len({(h.files, h.threads) for h in held[4:]}) == 1
     assert soak.growth(held) < 0.5  # MB a run; nothing of a run's images or clouds may stay
+
+
+def test_a_process_that_is_asked_to_stop_says_one_line():
+    code = """
+import os, signal, time
+import geomocap.cli.app
+from geomocap.cli import main
+
+def work():
+    import geomocap.model.rig  # with COLMAP's library, which has a handler of its own
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(60)
+
+geomocap.cli.app.app = work
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 130
+    assert done.stderr == "geomocap: interrupted; start it again to go on from what is finished\n"

@@ -126,7 +126,7 @@ def test_settings_are_the_runs_unless_given(run):
     run.write_record({"source": {"up": "z"}, "config": {"export": {"bvh_unit": "cm"}}})
     export_run(run, ["bvh"])
     assert (run.path / "motion.bvh").read_bytes() == centimetres
-    run.write_record({"config": {"export": {"bvh_unit": "mm"}}})
+    run.write_record({"source": {}, "config": {"export": {"bvh_unit": "mm"}}})
     with pytest.raises(SettingsError, match=r"run\.toml: setting bvh_unit = 'mm'"):
         export_run(run, ["bvh"])
 

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from importlib import resources
 from itertools import product
 
 import numpy as np
@@ -19,11 +20,13 @@ from geomocap.export.trc import read_trc
 from geomocap.files.run import Run
 from geomocap.model.skeleton import Skeleton
 from geomocap.naming.best_assignment import heaviest_choices
-from geomocap.naming.found_names import FoundNames, find_names
+from geomocap.naming.found_names import FoundNames, find_names, likely_parts
 from geomocap.naming.given_names import with_given
+from geomocap.naming.mean_posture import mean_posture
 from geomocap.naming.name_sets import renamed
 from geomocap.naming.name_templates import NamingError, built_in_templates, read_template
 from geomocap.naming.tree_features import nesting
+from geomocap.naming.tree_matching import match_tree
 from tests.geomocap.articulated import skeleton_arrays, skeleton_of
 from tests.geomocap.template_figures import figure
 
@@ -62,6 +65,19 @@ def test_joints_between_parts_in_one_body_are_told_as_missing():
     assert found.unparted == {"knee_right": "thigh_shank_right", "wrist_left": "forearm_hand_left"}
     assert renamed(found, "mixamo").unparted.keys() == found.unparted.keys()
     assert "# no knee_right: both its parts are in thigh_shank_right\n" in names_text(found)
+
+
+def test_what_a_body_holds_anyhow_is_told_where_its_joint_may_be_either():
+    def parts(*names):
+        return frozenset(
+            k for k, (part, side) in enumerate(zip(HUMAN.parts, HUMAN.sides, strict=True)) if f"{part}_{side}" in names
+        )
+
+    hand, lower, other = parts("hand_left"), parts("forearm_left", "hand_left"), parts("forearm_right", "hand_right")
+    assert likely_parts({hand: 0.8, lower: 0.2}, HUMAN) == (hand, 0.8)
+    assert likely_parts({hand: 0.5, lower: 0.45, frozenset(): 0.05}, HUMAN) == (hand, pytest.approx(0.95))
+    assert likely_parts({hand: 0.4, lower: 0.3, other: 0.3}, HUMAN) == (hand, pytest.approx(1.0))
+    assert likely_parts({hand: 0.4, parts("foot_left"): 0.35, frozenset(): 0.25}, HUMAN) == (frozenset(), 0)
 
 
 @pytest.mark.parametrize("template", [HUMAN, QUADRUPED, BIRD], ids=lambda t: t.name)
@@ -331,3 +347,48 @@ def test_subjects_of_which_little_is_known_keep_their_numbers(what):
     if what == "no rotation":
         arrays["body_rotations"][:, 3] = np.nan
     assert find_names(skeleton_of(arrays), 2).bodies == {}
+
+
+def with_a_thigh_in_two(folder, cut, knee=0.285):
+    """A person whose left thigh is two bodies, parted at a height; heights in shares of the person's."""
+    text = (resources.files("geomocap.naming") / "templates" / "human.toml").read_text()
+    top, rest = text.split("[parts.thigh]")
+    thigh, rest = rest.split("[parts.shank]")
+    piece = (
+        f"[parts.thigh_low]\npair = true\nparent = 'thigh'\njoint = [0.04, 0.06, {cut}]\n"
+        f"center = [0.03, 0.06, {(cut + knee) / 2}]\nsurface = 0.5\nmobility = 0.5\n\n"
+    )
+    low = rest.replace('parent = "thigh"', 'parent = "thigh_low"', 1).replace("0.285]", f"{knee}]", 1)
+    (folder / "long.toml").write_text(f"{top}[parts.thigh]{thigh}{piece}[parts.shank]{low}")
+    return figure(read_template(folder / "long.toml"), without=[("thigh_low", "right")])
+
+
+def test_a_limb_in_one_piece_more_is_named_as_the_other_side_is(tmp_path):
+    """Knees low for a person, and the left thigh in two: where it is parted, a knee would fit better by itself."""
+    skeleton, labels = with_a_thigh_in_two(tmp_path, 0.27, knee=0.18)
+    found = find_names(skeleton, 2, templates=[HUMAN])
+    named = dict(zip(labels, (found.bodies.get(b) for b in range(len(labels))), strict=True))
+    same = [name for name in labels if name != "thigh_low_left"]
+    assert [named[name] for name in same] == same and named["thigh_low_left"] in (None, "thigh_left_2")
+    ways = match_tree(mean_posture(skeleton, 2, None), HUMAN)
+    assert ways[0].score < max(way.score for way in ways)  # joint by joint the other would be likelier
+
+
+def test_a_piece_of_a_limb_hangs_beside_the_chain_in_a_rest_pose(tmp_path):
+    skeleton, labels = with_a_thigh_in_two(tmp_path, 0.42)
+    found = find_names(skeleton, 2, templates=[HUMAN])
+    motion = motion_from_skeleton(skeleton)
+    mesh = bone_mesh(motion)
+    rested, bound = at_rest(motion, mesh, found, "T", anatomical_frames(skeleton, found))
+    assert rested.largest_deviation_mm(skeleton.joint_positions) < 1e-6
+    assert bound is not None and np.abs(bound.posed(rested) - mesh.posed(motion)).max() < 1e-9
+    pieces = {b for b in range(skeleton.body_count) if b not in found.whole}
+    assert {labels[b] for b in pieces} & {"thigh_left", "thigh_low_left"} and len(pieces) == 1
+    (piece,) = (n for n, b in enumerate(rested.bodies.tolist()) if b in pieces)
+    assert not rested.children(piece) and np.isfinite(rested.tips[piece]).all()
+    thigh = next(n for n, b in enumerate(rested.bodies) if found.bodies.get(b) == "thigh_left")
+    assert found.bodies[rested.bodies[rested.parents[thigh]]] == "pelvis"
+    mine = next(n for n, b in enumerate(motion.bodies) if found.bodies.get(b) == "thigh_left")
+    before, after = (m.forward_kinematics()[0][:, n] for m, n in ((motion, mine), (rested, thigh)))
+    turned = np.einsum("tji,tjk->tik", before, after)
+    assert np.abs(turned - turned[0]).max() < 1e-9  # the same turns from another rest

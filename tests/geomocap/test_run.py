@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import numpy as np
 import open3d as o3d
 import pytest
 
-from geomocap.errors import RunError
+from geomocap.config import load_config
+from geomocap.errors import RunError, SettingsError
 from geomocap.files.atomic import write_atomic, write_text
 from geomocap.files.frame_files import read_voxels, write_voxels
 from geomocap.files.run import Run, stage_key
+from geomocap.files.run_records import source_path, source_places
 from geomocap.model.frame_geometry import Voxels
 
 HERE = "geomocap.files.run"
@@ -111,6 +114,56 @@ def test_a_record_that_no_run_wrote_is_refused(tmp_path, text, says):
     (tmp_path / "run.toml").write_text(text)
     with pytest.raises(RunError, match=rf"run\.toml: {says}.*; delete it and run again"):
         Run(tmp_path).read_record()
+
+
+def test_a_record_cut_anywhere_is_refused(tmp_path):
+    run = Run(tmp_path)
+    run.write_record(
+        {
+            "geomocap": {"version": "1"},
+            "source": {"fps": 30.0, "up": "z"},
+            "config": {"tracking": {"blurs_px": [2.5, 0.8], "n_patches": 4000}},
+            "versions": {"python": "3.11", "numpy": "2.4"},
+        }
+    )
+    whole = run.read_record()
+    file = tmp_path / "run.toml"
+    data = file.read_bytes()
+    for length in range(len(data) - 1):  # the last line's end is no loss
+        file.write_bytes(data[:length])
+        with pytest.raises(RunError, match=r"run\.toml: (cut off, it has|not valid TOML)"):
+            run.read_record()
+        assert run.faults() == {"run.toml": f"cut ({length} of {len(data)} bytes)"}
+    file.write_bytes(data)
+    assert run.read_record() == whole and run.faults() == {}
+
+
+def test_the_source_is_found_from_anywhere_and_where_it_was_moved_with_the_run(tmp_path, monkeypatch):
+    capture, run = tmp_path / "a" / "capture", tmp_path / "a" / "runs" / "one"
+    capture.mkdir(parents=True)
+    run.mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    told = source_places(run, Path("a/capture"))
+    assert told == {"path": str(capture), "from_run": "../../capture"}
+    monkeypatch.chdir("/")
+    assert source_path(run, told) == capture
+    assert source_path(run, {"path": "a/capture"}) == capture  # as older runs say it
+    (tmp_path / "a").rename(tmp_path / "b")
+    moved = tmp_path / "b" / "runs" / "one"
+    assert source_path(moved, told).resolve() == tmp_path / "b" / "capture"
+    (tmp_path / "b" / "capture").rmdir()
+    assert source_path(moved, told) == capture  # named in what is said of it
+
+
+def test_settings_of_a_record_that_is_cut_off_are_refused(tmp_path):
+    Run(tmp_path).write_record({"config": {"carving": {"resolution": 64, "margin": 0.1}}, "versions": {"a": "1"}})
+    file = tmp_path / "run.toml"
+    assert load_config(file).carving.resolution == 64
+    file.write_text(file.read_text().replace("resolution = 64", "resolution = 65"))  # as a user may
+    assert load_config(file).carving.resolution == 65
+    file.write_text(file.read_text().replace("margin = 0.1\n", ""))
+    with pytest.raises(SettingsError, match=r"run\.toml: cut off, it has 3 of the 4 values"):
+        load_config(file)
 
 
 def test_pipes_in_place_of_records_are_not_waited_for(tmp_path):

@@ -67,7 +67,8 @@ def blender() -> list[str]:
 def test_a_run_is_imported_as_it_is(tmp_path: Path) -> None:
     command = blender()
     made = make(tmp_path)
-    record = {"source": {"kind": "capture", "path": str(made.capture.path), "up": "z"}}
+    from_run = os.path.relpath(made.capture.path, made.run.path)
+    record = {"source": {"kind": "capture", "path": "/before/it/was/moved", "from_run": from_run, "up": "z"}}
     made.run.write_record(record)
     (made.run.path / "names.toml").write_text("[bodies]\nmy_head = 1\n")
     export_run(made.run, ["glb"])
