@@ -44,6 +44,8 @@ from viz.shown_names import named
 from viz.turntable import Turntable, turntable
 from viz.viewpoints import ViewStage
 
+COLUMNS = 4  # frames that sheets show
+
 _HOW = (
     "Drag to turn, click and scroll or pinch to come nearer, right-drag to shift; space plays, the arrow keys go on by "
     "single frames. Point at a body or joint to read its name, its angles with their band, and its confidence; click "
@@ -65,6 +67,7 @@ def review(
     capture: Capture | None = None,
     *,
     frames: Sequence[int] | None = None,
+    columns: int = COLUMNS,
     measured: Callable[[int], tuple[CloudFrame, np.ndarray] | None] = lambda _: None,
     progress: Progress = silent,
 ) -> list[Path]:
@@ -78,7 +81,9 @@ def review(
     capture : Capture, optional
         What the run was made from: needed for everything drawn over the images.
     frames : sequence of int, optional
-        Frames for the sheets; four evenly spread ones if not given.
+        Frames for the sheets; evenly spread ones if not given.
+    columns : int
+        How many these are.
     measured : callable, optional
         Gives the surface measurement of a frame, with regions and shifts that files don't hold, and the undistorted
         image of the template that gave most points; None: not to be had. Without it these pictures are left out.
@@ -100,7 +105,7 @@ def review(
     results = named(Results(run, capture))
     if not results.frames:
         raise RunError(f"{run.path}: holds no silhouettes and no geometry; run a stage first")
-    chosen = list(frames) if frames is not None else sheets.chosen_frames(results.frames, 4)
+    chosen = list(frames) if frames is not None else sheets.chosen_frames(results.frames, columns)
     unknown = [f for f in chosen if f not in results.frames]
     if unknown or not chosen:
         raise RunError(
