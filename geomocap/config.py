@@ -52,6 +52,7 @@ class Config(Settings):
 PREVIEW: dict[str, dict[str, Any]] = {
     "carving": {"resolution": 96},
     "tracking": {"n_patches": 1000},
+    "windows": {"frames": 600},  # as many positions as 4,000 patches have in 150
     "motion_bodies": {"depth_rounds": 1},
     "refinement": {"rounds": 1},
     "following": {"points": 600},
