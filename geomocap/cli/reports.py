@@ -23,9 +23,7 @@ from geomocap.pipeline.camera_stage import agreeing, without_left_out
 from geomocap.pipeline.cloud_stage import measure_again
 from geomocap.pipeline.job import Job
 from geomocap.progress import Progress, silent
-from viz.review import COLUMNS, review
-
-PREVIEW_COLUMNS = 2  # frames that the sheets of a preview's report show
+from viz.review import review
 
 
 def review_job(job: Job, made_from: str) -> None:
@@ -51,13 +49,8 @@ def review_run(run: Run, capture: Capture | None, progress: Progress = silent) -
     """Make pictures and report of a run, with a frame's surface measured again where it was measured."""
     capture = None if capture is None else as_seen(run, capture)
     preview = run.read_record().get("source", {}).get("preview") is not None
-    return review(
-        run,
-        capture,
-        columns=PREVIEW_COLUMNS if preview else COLUMNS,
-        measured=partial(measure_again, run, capture),
-        progress=progress,
-    )
+    measured = partial(measure_again, run, capture)
+    return review(run, capture, quick=preview, measured=measured, progress=progress)
 
 
 def agreeing_job(job: Job) -> Job:
