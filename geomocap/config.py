@@ -49,6 +49,28 @@ class Config(Settings):
     export: ExportSettings = Field(ExportSettings(), description="motion files")
 
 
+PREVIEW: dict[str, dict[str, Any]] = {
+    "carving": {"resolution": 96},
+    "tracking": {"n_patches": 1000},
+    "windows": {"frames": 600},  # as many positions as 4,000 patches have in 150
+    "motion_bodies": {"depth_rounds": 1},
+    "refinement": {"rounds": 1},
+    "following": {"points": 600},
+    "export": {"skin_triangles": 10_000},
+}
+"""What a preview's small images can still tell, and what takes little time; what a user sets goes before it."""
+
+
+def preview_config(config: Config) -> Config:
+    """Return the settings of a preview: `PREVIEW` in place of what nobody has set."""
+    tables = {}
+    for name, values in PREVIEW.items():
+        table = getattr(config, name)
+        given = table.model_fields_set if name in config.model_fields_set else set()
+        tables[name] = table.model_copy(update={k: v for k, v in values.items() if k not in given})
+    return config.model_copy(update=tables)
+
+
 def load_config(path: Path | None = None, overrides: dict[str, Any] | None = None) -> Config:
     """Read the settings from a TOML file, override single keys, and check them all.
 

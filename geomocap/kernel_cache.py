@@ -94,22 +94,28 @@ def _own_temporary() -> Iterator[Path]:
 
 def _digest(base: Path) -> str:
     """Digest of the kernels; the sources are parsed once for each state of their files, and the answer kept."""
-    note = base / f"{_files_digest()}.txt"
+    note = base / f"{files_digest(ROOT)}.txt"
     try:
         return note.read_text()
     except OSError:
         digest = kernels_digest(ROOT)
         with suppress(OSError):
-            temporary = base / f".{note.name}.{os.getpid()}"
-            temporary.write_text(digest)
-            os.replace(temporary, note)
+            write_note(note, digest)
         return digest
 
 
-def _files_digest() -> str:
+def write_note(file: Path, text: str) -> None:
+    """Write a small file beside the kernels, whole or not at all; raises OSError if it can't be written."""
+    temporary = file.with_name(f".{file.name}.{os.getpid()}")
+    temporary.write_text(text)
+    os.replace(temporary, file)
+
+
+def files_digest(root: Path) -> str:
+    """Digest of the names and contents of all sources below a folder's packages."""
     digest = hashlib.blake2b(digest_size=16)
-    for name in _sources(ROOT):
-        with open(os.path.join(ROOT, name), "rb") as file:
+    for name in _sources(root):
+        with open(os.path.join(root, name), "rb") as file:
             digest.update(hashlib.blake2b(name.encode() + b"\0" + file.read()).digest())
     return digest.hexdigest()
 
@@ -205,9 +211,10 @@ def _tidy(base: Path) -> None:
     for folder in folders[_KEPT:]:
         if -_age(folder) < last_day:
             shutil.rmtree(folder, ignore_errors=True)
-    for note in sorted(base.glob("*.txt"), key=_age)[8 * _KEPT :]:
-        with suppress(OSError):
-            note.unlink()
+    for kind in ("*.txt", "*.json"):
+        for note in sorted(base.glob(kind), key=_age)[8 * _KEPT :]:
+            with suppress(OSError):
+                note.unlink()
 
 
 def _age(path: Path) -> float:

@@ -7,11 +7,16 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import json
+import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import CodeType
 from typing import Any
+
+from geomocap.kernel_cache import cache_folder, files_digest, write_note
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("geomocap", "data_tools", "viz")
@@ -38,8 +43,10 @@ def module_digest(module: str) -> str:
         If it is no module of the project.
     """
     digest = hashlib.blake2b(digest_size=16)
-    for name in sorted(modules_behind(module)):
+    behind = sorted(modules_behind(module))
+    for name in behind:
         digest.update(f"{name} {_module_code(name)[0]}\n".encode())
+    _note(behind)
     return digest.hexdigest()
 
 
@@ -58,12 +65,44 @@ def modules_behind(module: str) -> set[str]:
 @cache
 def _module_code(module: str) -> tuple[str, frozenset[str]]:
     """Digest of a module's own code, and the modules of the project that it imports."""
+    if module in _noted():
+        digest, imports = _noted()[module]
+        return digest, frozenset(imports)
     file = module_file(module)
     if file is None:
         raise ModuleNotFoundError(f"{module} is no module of geomocap")
     tree = ast.parse(file.read_bytes())
     package = module if file.name == "__init__.py" else module.rpartition(".")[0]
     return code_digest(tree), frozenset(imported_modules(tree, package))
+
+
+@cache
+def _noted() -> dict[str, tuple[str, list[str]]]:
+    """What was found of modules when the sources were as they are now: compiling them all takes two seconds."""
+    try:
+        return dict(json.loads(_note_file().read_bytes()))
+    except (OSError, ValueError):
+        return {}
+
+
+def _note(modules: list[str]) -> None:
+    """Keep what was found of modules, for the next process."""
+    if not _noted().keys() >= set(modules):
+        for name in modules:
+            digest, imports = _module_code(name)
+            _noted()[name] = digest, sorted(imports)
+        with suppress(OSError):
+            write_note(_note_file(), json.dumps(_noted()))
+
+
+@cache
+def _note_file() -> Path:
+    """File for the sources as they are now and this Python; raises OSError if there is no place for it."""
+    folder = cache_folder()
+    if folder is None:
+        raise OSError("nothing can be written anywhere")
+    python = f"{sys.implementation.cache_tag}-{sys.hexversion:x}"
+    return folder.parent / f"{files_digest(ROOT)}-{python}.json"
 
 
 def module_file(module: str) -> Path | None:

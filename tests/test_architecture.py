@@ -18,8 +18,8 @@ ROOMS: dict[str, set[str]] = {
     "settings": {"errors", "reading"},
     "scheduling": {"progress"},
     "version": set(),
-    "source_digest": set(),
     "kernel_cache": set(),
+    "source_digest": {"kernel_cache"},
     # nouns, then the one room that reads and writes them
     "model": BASE,
     "files": VALUES | {"source_digest", "version"},

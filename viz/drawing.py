@@ -197,13 +197,13 @@ def on_paper(image: np.ndarray) -> np.ndarray:
 
 def write_png(path: Path, image: np.ndarray) -> None:
     """Write an image (H, W, 3) uint8 RGB as PNG, whole or not at all; one with opacity on white."""
-    buffer = io.BytesIO()
-    Image.fromarray(on_paper(image)).save(buffer, "PNG", optimize=False, compress_level=4)
-    write_bytes(path, buffer.getbuffer())
+    rows = cv2.cvtColor(on_paper(image), cv2.COLOR_RGB2BGR)
+    write_bytes(path, cv2.imencode(".png", rows, [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE])[1].data)
 
 
 def webp(image: np.ndarray, quality: int = 76) -> bytes:
     """Return an image (H, W, 3) uint8 RGB, or (H, W, 4) with opacity, as the bytes of a WebP picture."""
     buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "WEBP", quality=quality, alpha_quality=60, method=4)
+    # Methods above 2 take more than twice the time for 5 % less.
+    Image.fromarray(image).save(buffer, "WEBP", quality=quality, alpha_quality=60, method=2)
     return buffer.getvalue()

@@ -82,6 +82,7 @@ def motion_video(
     at_most: int = 100,
     progress: Progress = silent,
     turn_deg: float = 60.0,
+    look: Look | None = None,
 ) -> None:
     """Write the motion as a video: the bodies and the skeleton from a slowly turning view, and over a camera's image.
 
@@ -96,12 +97,14 @@ def motion_video(
     progress : Progress
     turn_deg : float
         How far the free view turns over the video, degrees.
+    look : Look, optional
 
     Raises
     ------
     RunError
         If there are no frames or the file can't be written.
     """
+    look = look or Look()
     step = max(1, -(-len(results.frames) // at_most))
     frames = results.frames[::step]
     fps = max(1.0, (results.fps or 15.0) / step)
@@ -118,12 +121,12 @@ def motion_video(
         bones = scene.skeleton(results, frame, stage.diagonal)
         panels = []
         if show_bodies:
-            panels.append(on_paper(picture(results, stage, Model([skin]), view, frame, Look())))
+            panels.append(on_paper(picture(results, stage, Model([skin]), view, frame, look)))
         model = Model([scene.glass(skin), *bones] if bones else [skin])
         if bones:
-            panels.append(on_paper(picture(results, stage, model, view, frame, Look())))
+            panels.append(on_paper(picture(results, stage, model, view, frame, look)))
         if camera is not None:
-            drawn = overlay(results, camera, frame, model, 520, 1.0 if bones else 0.7)
+            drawn = overlay(results, camera, frame, model, 520, 1.0 if bones else 0.7, look)
             panels.append(fit(drawn, (round(size[1] * drawn.shape[1] / drawn.shape[0]), size[1])))
         gap = np.full((size[1], GAP, 3), 255, np.uint8)
         image = np.concatenate([p for panel in panels for p in (panel, gap)][:-1], axis=1)

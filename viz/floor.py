@@ -37,8 +37,7 @@ def floor(stage: ViewStage, view: PinholeView, meshes: Sequence[Mesh] = (), cent
         Middle of the grid; the first frame's centre if not given.
     """
     width, height = view.size
-    scale = 2
-    dark = np.zeros((height * scale, width * scale), np.float32)
+    dark = np.zeros((height, width), np.float32)
     right = stage.broad
     ahead = np.cross(stage.up, right)
     middle = stage.centers[0] if center is None else np.asarray(center, float)
@@ -49,7 +48,7 @@ def floor(stage: ViewStage, view: PinholeView, meshes: Sequence[Mesh] = (), cent
         return Layer(np.zeros((height, width, 4), np.float32))
 
     if meshes:
-        dark = _shadow(dark.shape, stage, view, meshes, base, basis, scale)
+        dark = _shadow(dark.shape, stage, view, meshes, base, basis)
     step = grid_spacing(stage.diagonal)
     # The grid is fixed to the world: lines are at multiples of the step.
     origin = basis @ base
@@ -62,22 +61,23 @@ def floor(stage: ViewStage, view: PinholeView, meshes: Sequence[Mesh] = (), cent
             flat = np.column_stack([np.full(33, i), along])[:, [0, 1] if k == 0 else [1, 0]]
             segments.append(np.stack([flat[:-1], flat[1:]], axis=1))
     flat = np.concatenate(segments).reshape(-1, 2)
-    line = LINE[3] * _lines(dark.shape, view, base + (flat - origin) @ basis, scale)
-    rgba = np.empty((*dark.shape, 4), np.float32)
-    rgba[..., :3] = line[..., None] * np.array(LINE[:3], np.float32) / 255  # the shadow is black
+    line = np.float32(LINE[3]) * _lines((height, width), view, base + (flat - origin) @ basis)
+    rgba = np.empty((height, width, 4), np.float32)
+    for c in range(3):
+        rgba[..., c] = line * np.float32(LINE[c] / 255)  # the shadow is black
     rgba[..., 3] = line + (1 - line) * dark
-    return Layer(cv2.resize(rgba, (width, height), interpolation=cv2.INTER_AREA))
+    return Layer(rgba)
 
 
-def _lines(shape: tuple[int, int], view: PinholeView, points: np.ndarray, scale: int) -> np.ndarray:
-    """Draw segments between each two of the points (2 N, 3) that lie in front of the view: (H, W) float, 0 to 1."""
+def _lines(shape: tuple[int, int], view: PinholeView, points: np.ndarray, scale: int = 2) -> np.ndarray:
+    """Draw segments between each two of the points (2 N, 3) that lie in front of the view: (H, W) float32, 0 to 1."""
     pixels = view.project(points)[0].reshape(-1, 2, 2)
     near = np.isfinite(pixels).all(axis=(1, 2))
     near[near] = (np.abs(pixels[near]) < 1e4).all(axis=(1, 2))
     ends = np.rint((pixels[near] * scale - 0.5) * 16).astype(np.int32)
-    drawn = np.zeros(shape, np.uint8)
+    drawn = np.zeros((shape[0] * scale, shape[1] * scale), np.uint8)
     cv2.polylines(drawn, list(ends), False, 255, 1, cv2.LINE_8, 4)
-    return drawn.astype(np.float32) / 255
+    return np.asarray(cv2.resize(drawn, shape[::-1], interpolation=cv2.INTER_AREA)) / np.float32(255)
 
 
 def _shadow(
@@ -87,7 +87,6 @@ def _shadow(
     meshes: Sequence[Mesh],
     base: np.ndarray,
     basis: np.ndarray,
-    scale: int,
 ) -> np.ndarray:
     """Darkness (H, W) of the floor below the meshes, 0 to 1, the more the nearer they are to it."""
     cells = 160
@@ -107,6 +106,6 @@ def _shadow(
     if (depth <= 0).any():
         return np.zeros(shape, np.float32)
     source = np.array([[0, 0], [cells, 0], [cells, cells], [0, cells]], np.float32) - 0.5
-    H = cv2.getPerspectiveTransform(source, (pixels * scale - 0.5).astype(np.float32))
+    H = cv2.getPerspectiveTransform(source, (pixels - 0.5).astype(np.float32))
     dark = cv2.warpPerspective(table, H, (shape[1], shape[0]))
     return SHADE * np.clip(dark, 0, 1)

@@ -21,6 +21,7 @@ from viz.films import motion_video
 from viz.keypoint_marks import marks_of_run
 from viz.matching_review import frame_sheet, template_sheet
 from viz.quality_figures import Quality, assess, relative_paths
+from viz.rendering import Look
 from viz.report import Block, Report, missing, table, text, turning, video, write_report
 from viz.run_contents import Results
 from viz.scene import stage as find_stage
@@ -44,6 +45,8 @@ from viz.shown_names import named
 from viz.turntable import Turntable, turntable
 from viz.viewpoints import ViewStage
 
+COLUMNS, QUICK_COLUMNS = 4, 2  # frames that sheets show
+
 _HOW = (
     "Drag to turn, click and scroll or pinch to come nearer, right-drag to shift; space plays, the arrow keys go on by "
     "single frames. Point at a body or joint to read its name, its angles with their band, and its confidence; click "
@@ -65,6 +68,7 @@ def review(
     capture: Capture | None = None,
     *,
     frames: Sequence[int] | None = None,
+    quick: bool = False,
     measured: Callable[[int], tuple[CloudFrame, np.ndarray] | None] = lambda _: None,
     progress: Progress = silent,
 ) -> list[Path]:
@@ -79,6 +83,8 @@ def review(
         What the run was made from: needed for everything drawn over the images.
     frames : sequence of int, optional
         Frames for the sheets; four evenly spread ones if not given.
+    quick : bool
+        Two frames if not given, and a film whose edges are rougher.
     measured : callable, optional
         Gives the surface measurement of a frame, with regions and shifts that files don't hold, and the undistorted
         image of the template that gave most points; None: not to be had. Without it these pictures are left out.
@@ -100,7 +106,11 @@ def review(
     results = named(Results(run, capture))
     if not results.frames:
         raise RunError(f"{run.path}: holds no silhouettes and no geometry; run a stage first")
-    chosen = list(frames) if frames is not None else sheets.chosen_frames(results.frames, 4)
+    chosen = (
+        list(frames)
+        if frames is not None
+        else sheets.chosen_frames(results.frames, QUICK_COLUMNS if quick else COLUMNS)
+    )
     unknown = [f for f in chosen if f not in results.frames]
     if unknown or not chosen:
         raise RunError(
@@ -119,7 +129,7 @@ def review(
     desk.step()
     head = [*preview_note(results), *changed_files(results), *verdict(results), *summary(quality)]
     parts = [
-        section("Result", [*head, *_result(results, stage, chosen, turns, desk)]),
+        section("Result", [*head, *_result(results, stage, chosen, turns, desk, Look(samples=1 if quick else 2))]),
         section("What went in", _inputs(results, stage, chosen, desk)),
         section("Silhouettes", _silhouettes(results, quality, chosen, desk)),
         section("Volume and points", _volume(results, stage, chosen, desk)),
@@ -141,7 +151,7 @@ def review(
 
 
 def _result(
-    results: Results, stage: ViewStage | None, frames: list[int], turns: Turntable | None, desk: Desk
+    results: Results, stage: ViewStage | None, frames: list[int], turns: Turntable | None, desk: Desk, film: Look
 ) -> list[Block]:
     if stage is None:
         return [missing("The run holds no geometry yet, so there is no result to show; the silhouettes are below.")]
@@ -150,7 +160,7 @@ def _result(
         blocks.append(turning(sheets.still(results, stage, frames[len(frames) // 2]), "The subject", _HOW))
     if len(results.frames) > 1:
         path = desk.folder / "motion.mp4"
-        motion_video(results, stage, path, progress=desk.progress)
+        motion_video(results, stage, path, progress=desk.progress, look=film)
         desk.written.append(path)
         over = ", and over the image of one camera" if _calibrated(results) else ""
         words = "Look for limbs that keep their colour, joints that stay inside the volume, and bones that don't jump."

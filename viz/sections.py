@@ -153,8 +153,9 @@ def preview_note(results: Results) -> list[Block]:
         return []
     every = "every frame" if preview["every"] == 1 else f"one frame in {preview['every']}"
     words = (
-        f"This is a preview: {every}, images reduced to about {preview['longest']} pixels. It tells whether cameras, "
-        "silhouettes and bodies come out right, not how precise the motion will be: run again without --preview."
+        f"This is a preview: {every}, images reduced to about {preview['longest']} pixels, fewer patches and voxels. "
+        "It tells whether cameras, silhouettes and bodies come out right, not how precise the motion will be: run "
+        "again without --preview."
     )
     return [Block("warnings", items=(words,))]
 

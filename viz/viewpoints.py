@@ -7,6 +7,7 @@ the top-left pixel is (0.5, 0.5).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -152,7 +153,7 @@ class ViewStage:
     broad: np.ndarray
     floor: float
 
-    @property
+    @cached_property
     def diagonal(self) -> float:
         """Diagonal of the box of `points`, metres."""
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))

@@ -10,7 +10,7 @@ from pathlib import Path
 from geomocap.cli.execution import executor_for
 from geomocap.cli.progress_bars import progress_bars
 from geomocap.cli.reports import agreeing_job, tell_note, working
-from geomocap.config import Config
+from geomocap.config import Config, preview_config
 from geomocap.errors import GeomocapError, RunError
 from geomocap.files.capture import Capture
 from geomocap.files.preview import PreviewCapture
@@ -37,7 +37,7 @@ def capture_job(
     """Make the job of a capture or of its preview, with the subject's model if there is one."""
     opened = Capture.open(capture)
     if preview:
-        opened = PreviewCapture.of(opened)
+        opened, config = PreviewCapture.of(opened), preview_config(config)
         tell_note(
             f"preview: {opened.n_frames} frames, {opened.fps:.3g} a second, images of about {opened.longest} pixels"
         )

@@ -49,7 +49,9 @@ def review_job(job: Job, made_from: str) -> None:
 def review_run(run: Run, capture: Capture | None, progress: Progress = silent) -> list[Path]:
     """Make pictures and report of a run, with a frame's surface measured again where it was measured."""
     capture = None if capture is None else as_seen(run, capture)
-    return review(run, capture, measured=partial(measure_again, run, capture), progress=progress)
+    preview = run.read_record().get("source", {}).get("preview") is not None
+    measured = partial(measure_again, run, capture)
+    return review(run, capture, quick=preview, measured=measured, progress=progress)
 
 
 def agreeing_job(job: Job) -> Job:

@@ -139,8 +139,8 @@ def run(
     With a model of the subject, saved as model.npz by a run of another sequence, bodies and joints are not looked for:
     the model is found in this sequence and followed through it.
 
-    With --preview every n-th frame is used, so that 12 a second are left, and images are reduced to about 320 pixels:
-    it tells in little time whether cameras, silhouettes and bodies come out right.
+    With --preview every n-th frame is used, so that 12 a second are left, images are reduced to about 320 pixels, and
+    there are fewer patches and voxels: it tells in little time whether cameras, silhouettes and bodies come out right.
 
     Example: `geomocap run CAPTURE RUN --resolution 192 --bodies 15`
     """

@@ -43,13 +43,23 @@ def heaviest_choices(
             best = total, taken
         if not left:
             continue
-        room = min(sum(value[_first(left & s)] for s in sets if left & s) for sets in (of_group, of_kind))
-        if total + room <= best[0] + 1e-12:
+        least = best[0] + 1e-12
+        if total + _room(left, of_group, value) <= least or total + _room(left, of_kind, value) <= least:
             continue
         first = _first(left)
         stack.append((left & ~(1 << first), total, taken))
         stack.append((left & allowed[first], total + value[first], [*taken, first]))
     return None if best[1] is None else [int(order[i]) for i in best[1]]
+
+
+def _room(left: int, sets: list[int], value: list[float]) -> float:
+    """Most that choices from what is left can add, one of each set; values fall."""
+    room = 0.0
+    for s in sets:
+        some = left & s
+        if some:
+            room += value[(some & -some).bit_length() - 1]
+    return room
 
 
 def _bits(mask: np.ndarray) -> int:

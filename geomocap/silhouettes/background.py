@@ -212,23 +212,46 @@ def _noise(
     g = gradient[part][use]
     if g.size < 50:
         return np.full(gradient.shape, 2.0, np.float32)
-    mean = model.mean[part][use]
-    residuals = np.array(
-        [f[part][use] - (gain * mean + offset) for f, (gain, offset) in zip(frames, lights, strict=True)]
-    )
     edges = np.quantile(g, np.linspace(0, 1, GRADIENT_BINS + 1))
     which = np.clip(np.searchsorted(edges, g, side="right") - 1, 0, GRADIENT_BINS - 1)
+    order = np.argsort(which, kind="stable")
+    g, mean = g[order], model.mean[part][use][order]
+    pixels = np.flatnonzero(use)[order]
+    misses = np.empty((len(g), len(frames), 3))  # those of a class of gradients lie together
+    for t, (image, (gain, offset)) in enumerate(zip(frames, lights, strict=True)):
+        absolute_misses(image[part].reshape(-1, 3), pixels, mean, gain, offset, t, misses)
     x, y = [], []
-    for k in range(GRADIENT_BINS):
-        inside = which == k
-        if inside.sum() >= 20:
-            r = residuals[:, inside]
-            x.append(np.median(g[inside]) ** 2)
-            y.append((1.4826 * np.median(np.abs(r))) ** 2)
+    for inside in np.split(np.arange(len(g)), np.searchsorted(which[order], np.arange(1, GRADIENT_BINS))):
+        if len(inside) >= 20:
+            some = slice(inside[0], inside[-1] + 1)
+            x.append(np.median(g[some]) ** 2)
+            y.append((1.4826 * np.median(misses[some].ravel(), overwrite_input=True)) ** 2)
     a = max(float(np.median(y[: max(1, len(y) // 2)])), LEAST_NOISE**2)
     steepest = [max(0.0, v - a) / u for u, v in zip(x, y, strict=True) if u > 4.0][-4:]
     b = min(float(np.median(steepest)), MOST_JITTER**2) if steepest else 0.0
     return np.sqrt(a + b * gradient**2).astype(np.float32)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def absolute_misses(image, pixels, mean, gain, offset, frame, misses):
+    """By how much the background in a frame's light misses the frame, in each channel.
+
+    Parameters
+    ----------
+    image : (K, 3) uint8
+    pixels : (n,) int64
+        Which of the frame's pixels.
+    mean : (n, 3) float32
+        Background there.
+    gain, offset : (3,) float64
+    frame : int
+        Number t of the frame.
+    misses : (n, T, 3) float64
+        Filled in for this frame: |image - (gain · mean + offset)|.
+    """
+    for i in range(len(pixels)):
+        for c in range(3):
+            misses[i, frame, c] = abs(image[pixels[i], c] - (gain[c] * mean[i, c] + offset[c]))
 
 
 def _texture(mean: np.ndarray, sigma: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from geomocap.config import PREVIEW, Config, load_config, preview_config
 from geomocap.errors import RunError
 from geomocap.files.capture import Capture, CaptureInfo, write_capture_info
 from geomocap.files.preview import PreviewCapture, PreviewFrames, frames_apart, preview_of
@@ -143,3 +144,18 @@ def test_a_run_records_that_it_is_a_preview(whole, tmp_path):
         (tmp_path / "run.toml").write_text(f'[source]\nkind = "capture"\npreview = {wrong}\n')
         with pytest.raises(RunError, match=r"source\.preview"):
             read_run_record(tmp_path)
+
+
+def test_a_preview_takes_fewer_patches_voxels_and_rounds_unless_they_are_set(tmp_path):
+    (tmp_path / "mine.toml").write_text("[tracking]\nn_patches = 3000\nradius_px = 4\n")
+    config = preview_config(load_config(tmp_path / "mine.toml", {"carving": {"resolution": 200}}))
+    assert (config.carving.resolution, config.tracking.n_patches, config.tracking.radius_px) == (200, 3000, 4)
+    assert config.motion_bodies.depth_rounds < Config().motion_bodies.depth_rounds
+    assert config.cloud == Config().cloud
+    plain = preview_config(Config())
+    assert plain.windows.frames * plain.tracking.n_patches == Config().windows.frames * Config().tracking.n_patches
+    for name, values in PREVIEW.items():
+        whole, quick = getattr(Config(), name), getattr(plain, name)
+        assert type(quick)(**quick.model_dump()) == quick  # within the settings' own ranges
+        if name != "windows":
+            assert all(getattr(quick, k) < getattr(whole, k) for k in values)

@@ -11,6 +11,7 @@ import pytest
 from geomocap.errors import CaptureError, SettingsError
 from geomocap.silhouettes.background import (
     BackgroundModel,
+    absolute_misses,
     add_agreeing,
     agreement,
     model_from_frames,
@@ -155,6 +156,17 @@ def test_frames_that_agree_with_the_plate_are_added_as_in_numpy() -> None:
     assert 0.2 < agrees.mean() < 0.8
     np.testing.assert_array_equal(count, 1 + agrees)
     np.testing.assert_array_equal(total, plate + value * agrees[..., None])
+
+
+def test_misses_are_those_of_the_reference() -> None:
+    rng = np.random.default_rng(4)
+    image, mean = rng.integers(0, 256, (50, 3), dtype=np.uint8), rng.uniform(0, 255, (20, 3)).astype(np.float32)
+    pixels = rng.choice(50, 20, replace=False)
+    gain, offset = rng.uniform(0.9, 1.1, 3), rng.normal(size=3)
+    misses = np.full((20, 4, 3), -1.0)
+    absolute_misses(image, pixels, mean, gain, offset, 2, misses)
+    np.testing.assert_array_equal(misses[:, 2], np.abs(image[pixels] - (gain * mean + offset)))
+    assert (misses[:, [0, 1, 3]] == -1).all()
 
 
 def test_noise_is_measured(model: BackgroundModel) -> None:

@@ -81,8 +81,7 @@ def test_changed_code_changes_the_keys_of_the_stages_that_use_it(tmp_path, monke
     monkeypatch.setattr(source_digest, "ROOT", tmp_path)
 
     def digests():
-        source_digest._module_code.cache_clear()
-        source_digest.module_digest.cache_clear()
+        forget()
         return [source_digest.module_digest(f"geomocap.pipeline.{name}") for name in ("one", "two")]
 
     try:
@@ -93,9 +92,20 @@ def test_changed_code_changes_the_keys_of_the_stages_that_use_it(tmp_path, monke
         kernel.write_text(kernel.read_text().replace("2 * x", "3 * x"))
         after = digests()
         assert after[0] != before[0] and after[1] == before[1]  # settings are not followed: their values are in the key
+        monkeypatch.setattr(source_digest, "code_digest", None)  # what is noted is not looked into again
+        assert digests() == after
+        source_digest._note_file().write_text("damaged")
+        monkeypatch.undo()
+        monkeypatch.setattr(source_digest, "ROOT", tmp_path)
+        assert digests() == after
     finally:
-        source_digest._module_code.cache_clear()
-        source_digest.module_digest.cache_clear()
+        source_digest._note_file().unlink(missing_ok=True)
+        forget()
+
+
+def forget():
+    for known in ("_module_code", "module_digest", "_noted", "_note_file"):
+        getattr(source_digest, known).cache_clear()
 
 
 def test_an_unknown_module_is_refused():

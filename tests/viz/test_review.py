@@ -96,6 +96,19 @@ def test_pictures_repeat_to_the_bit(made: Made, reviewed: list[Path], tmp_path: 
     assert joint_angles(results.skeleton, 30.0) == (made.run.path / "review" / "joint_angles.png").read_bytes()
 
 
+def test_a_quick_report_shows_two_frames_and_the_same_film(made: Made, reviewed: list[Path], tmp_path: Path) -> None:
+    shutil.copytree(made.run.path, tmp_path / "run", ignore=shutil.ignore_patterns("review"))
+    (tmp_path / "run" / "skeleton.npz").unlink()  # the fewer pictures
+    written = {f.name: f for f in review(Run(tmp_path / "run"), quick=True)}
+    sizes = []
+    for file in (written["volume.png"], made.run.path / "review" / "volume.png"):
+        with Image.open(file) as image:
+            sizes.append(image.size)
+    assert sizes[0] == sizes[1]  # two frames here as well
+    with av.open(str(written["motion.mp4"])) as container:
+        assert sum(1 for _ in container.decode(video=0)) == 6
+
+
 def test_cameras_that_contradict_and_names_are_told(made: Made, tmp_path: Path) -> None:
     run = Run(shutil.copytree(made.run.path, tmp_path / "run"))
     word = "cam1 contradicts the others: it seems mirrored"
