@@ -18,6 +18,11 @@ from geomocap.files.atomic import write_text
 from viz.drawing import DENSITY, webp
 from viz.turntable import Turntable
 
+_HOW_TO_TURN = (
+    "Drag to turn, click and scroll or pinch to come nearer, right-drag to shift; space plays, the arrow keys go on by "
+    "single frames. Point at a body or joint to read its name, its angles with their band, and its confidence; click "
+    "it to keep that in view."
+)
 EMBEDDED_VIDEO = 6_000_000
 """Videos up to this many bytes go into the page; larger ones are linked beside it."""
 
@@ -95,9 +100,9 @@ def plot(png: bytes, title: str, words: str) -> Block:
     return Block("picture", words, title, source, round(width / DENSITY), round(height / DENSITY), look="plot")
 
 
-def turning(still: np.ndarray | None, title: str, words: str) -> Block:
+def turning(still: np.ndarray | None, title: str) -> Block:
     """Return the place of the report's turntable, with a picture for browsers that can't draw it."""
-    return Block("turntable", words, title, "" if still is None else _data_uri("image/webp", webp(still)))
+    return Block("turntable", _HOW_TO_TURN, title, "" if still is None else _data_uri("image/webp", webp(still)))
 
 
 def video(file: Path, title: str, words: str, folded: bool = False) -> Block:

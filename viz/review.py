@@ -45,14 +45,6 @@ from viz.shown_names import named
 from viz.turntable import Turntable, turntable
 from viz.viewpoints import ViewStage
 
-COLUMNS, QUICK_COLUMNS = 4, 2  # frames that sheets show
-
-_HOW = (
-    "Drag to turn, click and scroll or pinch to come nearer, right-drag to shift; space plays, the arrow keys go on by "
-    "single frames. Point at a body or joint to read its name, its angles with their band, and its confidence; click "
-    "it to keep that in view."
-)
-
 _FOLLOWED = {
     "patches": "patches of the images",
     "points": "points that the scans have in common",
@@ -106,11 +98,7 @@ def review(
     results = named(Results(run, capture))
     if not results.frames:
         raise RunError(f"{run.path}: holds no silhouettes and no geometry; run a stage first")
-    chosen = (
-        list(frames)
-        if frames is not None
-        else sheets.chosen_frames(results.frames, QUICK_COLUMNS if quick else COLUMNS)
-    )
+    chosen = list(frames) if frames is not None else sheets.chosen_frames(results.frames, 2 if quick else 4)
     unknown = [f for f in chosen if f not in results.frames]
     if unknown or not chosen:
         raise RunError(
@@ -157,7 +145,7 @@ def _result(
         return [missing("The run holds no geometry yet, so there is no result to show; the silhouettes are below.")]
     blocks: list[Block] = []
     if turns is not None:
-        blocks.append(turning(sheets.still(results, stage, frames[len(frames) // 2]), "The subject", _HOW))
+        blocks.append(turning(sheets.still(results, stage, frames[len(frames) // 2]), "The subject"))
     if len(results.frames) > 1:
         path = desk.folder / "motion.mp4"
         motion_video(results, stage, path, progress=desk.progress, look=film)

@@ -23,11 +23,11 @@ def outlines_of(job: Job) -> Outlines | None:
     frames = np.unique(np.linspace(0, capture.n_frames - 1, min(_FRAMES, capture.n_frames)).round().astype(int))
     height, width = undistortion.valid.shape[1:]
     factor = max(1, round(max(height, width) / _LONGEST_SIDE))
-    seen = _pooled(undistortion.valid, factor, np.min)
+    seen = _blocks(undistortion.valid, factor).min(axis=(2, 4))
     empty = np.empty((len(frames), *seen.shape), np.uint8)
     for k, frame in enumerate(frames):
         views = undistortion.views([read_silhouette(job.run, camera, int(frame)) for camera in capture.cameras])
-        empty[k] = seen & (_pooled(views.masks, factor, np.max) == 0)
+        empty[k] = seen & (_blocks(views.masks, factor).max(axis=(2, 4)) == 0)
         empty[k, views.blind()] = 0  # an empty silhouette has no say
     projections = undistortion.projections.copy()
     projections[:, :2] /= factor
@@ -35,9 +35,8 @@ def outlines_of(job: Job) -> Outlines | None:
     return Outlines(frames, projections, empty)
 
 
-def _pooled(masks: np.ndarray, factor: int, how: np.ufunc) -> np.ndarray:
-    """Masks (C, H, W) in pixels `factor` times as large; what is left over on the right and below is cut off."""
+def _blocks(masks: np.ndarray, factor: int) -> np.ndarray:
+    """Masks (C, H, W) in blocks, (C, H', factor, W', factor); what is left over on the right and below is cut off."""
     C, H, W = masks.shape
     height, width = H // factor, W // factor
-    cut = masks[:, : height * factor, : width * factor]
-    return how(cut.reshape(C, height, factor, width, factor), axis=(2, 4))
+    return masks[:, : height * factor, : width * factor].reshape(C, height, factor, width, factor)
