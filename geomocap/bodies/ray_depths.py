@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.bodies.motion_bodies import MotionBodies, find_motion_bodies
 from geomocap.bodies.rigid_motions import fit_rigid_motion
-from geomocap.bodies.shape_across_time import hull_fronts
+from geomocap.bodies.shape_across_time import MAY_MISS, hull_fronts
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.outlines import Outlines
 from geomocap.model.small_systems import solve_symmetric
@@ -54,11 +54,14 @@ class _RestPlaces:
         Root mean square distance across the rays.
     depth : (N, T) float, metres
         Along the rays, from the given positions; 0 where these are sure or missing.
+    outside : (N,) float
+        Fraction of the silhouettes that motions carry samples out of, however deep these lie.
     """
 
     rest: np.ndarray
     miss: np.ndarray
     depth: np.ndarray
+    outside: np.ndarray
 
 
 def find_bodies_and_depths(
@@ -158,13 +161,15 @@ def _choose(
     """Largest of the bodies that explain each sample, (N,) int; that which it has if there is none nearby."""
     assert paths.ray is not None
     count = len(rotations)
-    misses = np.full((len(label), count), np.inf)
+    misses, outside = np.full((len(label), count), np.inf), np.ones((len(label), count))
     alone = np.maximum((paths.ray.any(axis=2) & paths.seen).sum(axis=1), 1)
     for b in range(count):
         found = _place(paths, rotations[b : b + 1], translations[b : b + 1], outlines)
         near = cKDTree(rest[label == b]).query(found.rest)[0] < _LOCAL * paths.diagonal
         before = found.depth.sum(axis=1) / alone < -_BEFORE * paths.diagonal
-        misses[:, b] = np.where(near & ~before, found.miss, np.inf)
+        misses[:, b], outside[:, b] = np.where(near & ~before, found.miss, np.inf), found.outside
+    # a motion that carries a sample out of silhouettes in which another one keeps it is not its own
+    misses[outside > outside.min(axis=1, keepdims=True) + MAY_MISS] = np.inf
     best = misses.min(axis=1)
     limit = np.maximum(_NEARLY_BEST * best, _EXPLAINED * float(np.median(own.miss)))
     sizes = np.bincount(label, minlength=count)
@@ -212,19 +217,21 @@ def _place(
     motions = np.ascontiguousarray(rotations), np.ascontiguousarray(translations)
     diagonal = paths.diagonal
     largest = _LARGEST * diagonal
-    found = _RestPlaces(*place_samples(positions, paths.seen, ray, *motions, _DEPTH_FRACTION, largest))
+    found = _RestPlaces(
+        *place_samples(positions, paths.seen, ray, *motions, _DEPTH_FRACTION, largest), np.zeros(paths.count)
+    )
     if outlines is None:
         return found
     seen_along = np.where(paths.seen[..., None], ray, 0.0)
     inward = np.einsum("ntji,ntj->ni", np.broadcast_to(rotations, (*ray.shape, 3)), seen_along)
     length = np.linalg.norm(inward, axis=1, keepdims=True)
     inward /= np.where(length > 0, length, 1.0)
-    shift = hull_fronts(found.rest, inward, *motions, outlines, _STEP * diagonal, _REACH * diagonal)
+    shift, outside = hull_fronts(found.rest, inward, *motions, outlines, _STEP * diagonal, _REACH * diagonal)
     front = found.rest + shift[:, None] * inward
     carried = np.einsum("ntij,nj->nti", np.broadcast_to(rotations, (*ray.shape, 3)), front) + translations
     deeper = np.where(paths.seen, ((carried - positions) * ray).sum(axis=2), 0.0)
     moved = positions + deeper[..., None] * ray
-    again = _RestPlaces(*place_samples(moved, paths.seen, ray, *motions, _FRONT_FRACTION, largest))
+    again = _RestPlaces(*place_samples(moved, paths.seen, ray, *motions, _FRONT_FRACTION, largest), outside)
     return replace(again, depth=deeper + again.depth)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from geomocap.model.outlines import Outlines
 from geomocap.scheduling import spread
 
-_MAY_MISS = 0.05  # fraction of the views
+MAY_MISS = 0.05  # fraction of the views that a place of the hull may be outside of
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -45,7 +45,7 @@ def _misses(place, m, rotations, translations, frames, projections, empty, most)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _fronts(begin, end, motion, rest, inward, rotations, translations, frames, views, steps, may_miss, shift):
+def _fronts(begin, end, motion, rest, inward, rotations, translations, frames, views, steps, may_miss, shift, missed):
     projections, empty, step = views
     allowed = int(may_miss * empty.shape[0] * empty.shape[1])
     place, counts = np.empty(3), np.empty(2 * steps + 1, np.int64)
@@ -59,6 +59,7 @@ def _fronts(begin, end, motion, rest, inward, rotations, translations, frames, v
             count = _misses(place, motion[i], rotations, translations, frames, projections, empty, most)
             counts[steps + s] = count
             least = min(least, count)
+        missed[i] = least / max(empty.shape[0] * empty.shape[1], 1)
         s = steps
         if counts[s] > least + allowed:  # before the hull
             while s < 2 * steps and counts[s] > least + allowed:
@@ -81,8 +82,7 @@ def hull_fronts(
     outlines: Outlines,
     step: float,
     reach: float,
-    may_miss: float = _MAY_MISS,
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """How far places are from the front of the hull that the silhouettes of all frames leave of their bodies.
 
     Parameters
@@ -94,20 +94,22 @@ def hull_fronts(
     outlines : Outlines
     step, reach : float, metres
         Of the search along `inward`, to and fro.
-    may_miss : float
-        Fraction of the silhouettes that a place of the hull may be outside of, besides those that every place of its
-        line is outside of: these are at fault themselves, or the motion is.
 
     Returns
     -------
-    (N,) float, metres
+    shift : (N,) float, metres
         To be gone along `inward`; 0 where no front is within reach.
+    missed : (N,) float
+        Fraction of the silhouettes that every place of the line is outside of: these are at fault themselves, or the
+        motion is. A place of the hull may be outside of a twentieth more.
     """
-    shift = np.zeros(len(rest))
+    shift, missed = np.zeros(len(rest)), np.zeros(len(rest))
     motion = np.arange(len(rest)) if len(rotations) > 1 else np.zeros(len(rest), np.int64)
     views = np.ascontiguousarray(outlines.projections, np.float64), outlines.empty, float(step)
     arrays = motion, np.ascontiguousarray(rest), np.ascontiguousarray(inward), np.ascontiguousarray(rotations)
     frames = np.asarray(outlines.frames, np.int64)
-    work = *arrays, np.ascontiguousarray(translations), frames, views, int(np.ceil(reach / step)), may_miss, shift
-    spread(_fronts, len(rest), *work)
-    return shift
+    steps = int(np.ceil(reach / step))
+    spread(
+        _fronts, len(rest), *arrays, np.ascontiguousarray(translations), frames, views, steps, MAY_MISS, shift, missed
+    )
+    return shift, missed
