@@ -13,6 +13,7 @@ import numpy as np
 from geomocap.model.outlines import Outlines
 from geomocap.scheduling import spread
 
+_HALVINGS = 3  # of a step, where the front is in one
 MAY_MISS = 0.05  # fraction of the views that a place of the hull may be outside of
 
 
@@ -71,7 +72,18 @@ def _fronts(begin, end, motion, rest, inward, rotations, translations, frames, v
                 s -= 1
             if s == 0:
                 continue
-        shift[i] = (s - steps) * step
+        inside = (s - steps) * step
+        outside = inside - step
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (inside + outside)
+            for c in range(3):
+                place[c] = rest[i, c] + middle * inward[i, c]
+            most = least + allowed
+            if _misses(place, motion[i], rotations, translations, frames, projections, empty, most) <= most:
+                inside = middle
+            else:
+                outside = middle
+        shift[i] = inside
 
 
 def hull_fronts(
@@ -93,7 +105,7 @@ def hull_fronts(
         Motions since rest of each place, or of all; rotations may be blends.
     outlines : Outlines
     step, reach : float, metres
-        Of the search along `inward`, to and fro.
+        Of the search along `inward`, to and fro; the front is then found to an eighth of a step.
 
     Returns
     -------

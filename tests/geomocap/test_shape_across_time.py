@@ -62,23 +62,36 @@ def reference(rest, inward, turns, shifts, outlines, step, reach):
     s = np.arange(-steps, steps + 1)
     allowed = int(MAY_MISS * outlines.empty.shape[0] * outlines.empty.shape[1])
     result, missed = np.zeros(len(rest)), np.zeros(len(rest))
-    for i in range(len(rest)):
-        line = rest[i] + step * s[:, None] * inward[i]
-        counts = np.zeros(len(s), int)
+
+    def misses(line):
+        counts = np.zeros(len(line), int)
         for k, t in enumerate(outlines.frames):
             pixels = np.rint(project(outlines.projections, line @ turns[t].T + shifts[t])).astype(int)
             for c in range(len(pixels)):
                 x, y = pixels[c].T
                 inside = (x >= 0) & (y >= 0) & (x < SIZE) & (y < SIZE)
                 counts[inside] += outlines.empty[k, c, y[inside], x[inside]]
+        return counts
+
+    for i in range(len(rest)):
+        counts = misses(rest[i] + step * s[:, None] * inward[i])
         missed[i] = counts.min() / outlines.empty[:, :, 0, 0].size
         good = counts <= counts.min() + allowed
-        later = np.flatnonzero(good[steps:])
-        if not good[steps]:
-            result[i] = step * later[0] if len(later) else 0.0
+        later, before = np.flatnonzero(good[steps:]), np.flatnonzero(~good[:steps])
+        if not good[steps] and len(later):
+            inside = step * later[0]
+        elif good[steps] and len(before):
+            inside = step * (before[-1] + 1 - steps)
         else:
-            before = np.flatnonzero(~good[:steps])
-            result[i] = step * (before[-1] + 1 - steps) if len(before) else 0.0
+            continue
+        outside = inside - step
+        for _ in range(3):
+            middle = 0.5 * (inside + outside)
+            if misses((rest[i] + middle * inward[i])[None])[0] <= counts.min() + allowed:
+                inside = middle
+            else:
+                outside = middle
+        result[i] = inside
     return result, missed
 
 
