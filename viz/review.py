@@ -26,6 +26,7 @@ from viz.report import Block, Report, missing, table, text, turning, video, writ
 from viz.run_contents import Results
 from viz.scene import stage as find_stage
 from viz.sections import (
+    FOLLOWED,
     bodies_table,
     camera_remarks,
     cameras_table,
@@ -45,22 +46,11 @@ from viz.shown_names import named
 from viz.turntable import Turntable, turntable
 from viz.viewpoints import ViewStage
 
-COLUMNS, QUICK_COLUMNS = 4, 2  # frames that sheets show
-
 _HOW = (
     "Drag to turn, click and scroll or pinch to come nearer, right-drag to shift; space plays, the arrow keys go on by "
     "single frames. Point at a body or joint to read its name, its angles with their band, and its confidence; click "
     "it to keep that in view."
 )
-
-_FOLLOWED = {
-    "patches": "patches of the images",
-    "points": "points that the scans have in common",
-    "nodes": "nodes of a deformable surface",
-    "both": "nodes of a deformable surface, held by patches of the images",
-    "pieces": "patches of the images, and nodes of a deformable surface where these leave it uncovered",
-    "ellipsoids": "ellipsoids",
-}
 
 
 def review(
@@ -106,11 +96,7 @@ def review(
     results = named(Results(run, capture))
     if not results.frames:
         raise RunError(f"{run.path}: holds no silhouettes and no geometry; run a stage first")
-    chosen = (
-        list(frames)
-        if frames is not None
-        else sheets.chosen_frames(results.frames, QUICK_COLUMNS if quick else COLUMNS)
-    )
+    chosen = list(frames) if frames is not None else sheets.chosen_frames(results.frames, 2 if quick else 4)
     unknown = [f for f in chosen if f not in results.frames]
     if unknown or not chosen:
         raise RunError(
@@ -327,7 +313,7 @@ def _separation(results: Results, stage: ViewStage | None, desk: Desk) -> list[B
     chosen = found.sample_body
     if stage is None or chosen is None:
         return []
-    followed = _FOLLOWED.get(found.paths or "", "motion paths")
+    followed = FOLLOWED.get(found.paths or "", "motion paths")
     words = (
         f"The bodies come from {len(chosen)} {followed}, followed through all frames. Where a subject "
         "bends in many small steps, like a trunk or a tail, any border is arbitrary: the other numbers of bodies are "
