@@ -26,6 +26,7 @@ from viz.report import Block, Report, missing, table, text, turning, video, writ
 from viz.run_contents import Results
 from viz.scene import stage as find_stage
 from viz.sections import (
+    FOLLOWED,
     bodies_table,
     camera_remarks,
     cameras_table,
@@ -44,15 +45,6 @@ from viz.sections import (
 from viz.shown_names import named
 from viz.turntable import Turntable, turntable
 from viz.viewpoints import ViewStage
-
-_FOLLOWED = {
-    "patches": "patches of the images",
-    "points": "points that the scans have in common",
-    "nodes": "nodes of a deformable surface",
-    "both": "nodes of a deformable surface, held by patches of the images",
-    "pieces": "patches of the images, and nodes of a deformable surface where these leave it uncovered",
-    "ellipsoids": "ellipsoids",
-}
 
 
 def review(
@@ -315,7 +307,7 @@ def _separation(results: Results, stage: ViewStage | None, desk: Desk) -> list[B
     chosen = found.sample_body
     if stage is None or chosen is None:
         return []
-    followed = _FOLLOWED.get(found.paths or "", "motion paths")
+    followed = FOLLOWED.get(found.paths or "", "motion paths")
     words = (
         f"The bodies come from {len(chosen)} {followed}, followed through all frames. Where a subject "
         "bends in many small steps, like a trunk or a tail, any border is arbitrary: the other numbers of bodies are "

@@ -14,6 +14,16 @@ from viz.quality_figures import Quality
 from viz.report import Block, Section, missing, table, text
 from viz.run_contents import Results
 
+FOLLOWED = {
+    "patches": "patches of the images",
+    "points": "points that the scans have in common",
+    "nodes": "nodes of a deformable surface",
+    "both": "nodes of a deformable surface, held by patches of the images",
+    "pieces": "patches of the images, and nodes of a deformable surface where these leave it uncovered",
+    "ellipsoids": "ellipsoids",
+}
+"""What the samples were whose paths told the bodies apart, by `segmentation.paths`."""
+
 
 def section(title: str, blocks: list[Block]) -> Section:
     """Return a section whose anchor follows from its title."""

@@ -24,7 +24,6 @@ from geomocap.pipeline.camera_stage import agreeing, without_left_out
 from geomocap.pipeline.cloud_stage import measure_again
 from geomocap.pipeline.job import Job
 from geomocap.progress import Progress, silent
-from viz.review import review
 
 
 def review_job(job: Job, made_from: str) -> None:
@@ -35,6 +34,8 @@ def review_job(job: Job, made_from: str) -> None:
     made_from : str
         Key of the last stage that the report shows.
     """
+    from viz.review import review  # only where pictures are made: Matplotlib takes half a second
+
     templates = fingerprint([Path(review.__code__.co_filename).parent / "templates"])
     key = stage_key(review.__module__, "review", made_from, job.up, templates, sorted(job.run.read_timings()))
 
@@ -48,6 +49,8 @@ def review_job(job: Job, made_from: str) -> None:
 
 def review_run(run: Run, capture: Capture | None, progress: Progress = silent) -> list[Path]:
     """Make pictures and report of a run, with a frame's surface measured again where it was measured."""
+    from viz.review import review
+
     capture = None if capture is None else as_seen(run, capture)
     preview = run.read_record().get("source", {}).get("preview") is not None
     measured = partial(measure_again, run, capture)

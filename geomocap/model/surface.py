@@ -21,6 +21,7 @@ MOST_CELLS = 40_000_000  # of the grid in which a shell is filled
 NEIGHBOURS = 16  # points that make a normal
 SHEET = 0.05  # fall a cell of a smoothed shell below which it tells no side; 0.27 at the surface of a solid
 COARSEST, FINEST = 4, 8  # depths of the octree
+FOURFOLD, SURELY = 6, 2  # from this depth on there are four times the triangles in the next one, at least twice
 TRIM = 3.0  # spacings or cells from the nearest point beyond which surface is invented
 SMALLEST_PART = 0.01  # fraction of the triangles; smaller parts are dirt
 
@@ -64,10 +65,20 @@ def surface_through(points: np.ndarray, normals: np.ndarray | None = None, max_t
     cloud.normals = o3d.utility.Vector3dVector(outward_normals(points) if normals is None else normals)
     diagonal = float(np.ptp(points, axis=0).max())
     finest = int(np.clip(np.ceil(np.log2(1.1 * diagonal / spacing)), COARSEST, FINEST))
-    for depth in range(finest, COARSEST - 1, -1):
-        mesh = _trimmed_poisson(cloud, points, depth, TRIM * max(spacing, diagonal / 2**depth))
-        if len(mesh.triangles) <= max_triangles:
-            break
+
+    def at(depth: int) -> o3d.geometry.TriangleMesh:
+        return _trimmed_poisson(cloud, points, depth, TRIM * max(spacing, diagonal / 2**depth))
+
+    # The finest that has few enough; it takes longest, so it is made last, and not where it has too many for sure
+    depth = max(COARSEST, finest - 1)
+    mesh = at(depth)
+    if len(mesh.triangles) > max_triangles:
+        while len(mesh.triangles) > max_triangles and depth > COARSEST:
+            depth -= 1
+            mesh = at(depth)
+    elif depth < finest and (depth < FOURFOLD or SURELY * len(mesh.triangles) <= max_triangles):
+        finer = at(finest)
+        mesh = finer if len(finer.triangles) <= max_triangles else mesh
     if len(mesh.triangles) == 0:
         raise GeometryError("no surface could be laid through the points; choose another reference frame")
     mesh.compute_vertex_normals()

@@ -75,8 +75,10 @@ def find_correction(job: Job, capture: Capture) -> CameraCorrection:
 def _cut_alone(job: Job, capture: Capture, frames: list[int], shrink: int) -> list[tuple[np.ndarray, ...]]:
     """Silhouettes of reduced images, each camera alone."""
     settings = job.config.silhouettes
-    learn = _LearnReduced(capture, settings, shrink)
+    learn = LearnBackground(capture, settings, shrink)
     models = list(map_items(learn, capture.cameras, job.executor, "cameras", job.progress, 2))
+    if shrink == 1:
+        job.backgrounds.update(zip(capture.cameras, models, strict=True))
     scene = SilhouetteScene.unlearnt(models, None, settings)
     read = _ReadReduced(capture, shrink)
     scene = scene.learnt(scene.count(read(k)) for k in learning_frames(capture.n_frames))
@@ -102,22 +104,24 @@ class _ReadReduced:
 
 
 @dataclass(frozen=True)
-class _LearnReduced:
-    """Background model of one camera in reduced images."""
+class LearnBackground:
+    """Background model of one camera, in images reduced by a whole factor."""
 
     capture: Capture
     settings: SilhouetteSettings
-    shrink: int
+    shrink: int = 1
 
     def __call__(self, camera: str) -> BackgroundModel:
-        recorded = self.capture.sources[camera]
+        """Learn it from frames spread over the recording."""
+        recorded = self.capture.sources[camera]  # also the frames before the subject came in
         count = min(self.settings.samples, len(recorded))
         chosen = np.unique(np.linspace(0, len(recorded) - 1, count).round().astype(int))
         frames = [_reduced(recorded.read(int(k)), self.shrink) for k in chosen]
         if not self.capture.has_background(camera):
             return model_from_frames(frames, self.settings, camera)
         plate = _reduced(self.capture.background(camera), self.shrink)
-        plate[..., 3] = np.where(plate[..., 3] == 255, 255, 0)  # a pixel is known if all that it covers is
+        if self.shrink > 1:
+            plate[..., 3] = np.where(plate[..., 3] == 255, 255, 0)  # a pixel is known if all that it covers is
         return model_from_plate(plate, frames, self.settings, camera)
 
 

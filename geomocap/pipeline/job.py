@@ -6,7 +6,7 @@ import os
 import platform
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from geomocap.files.scans import Scans
 from geomocap.files.stage_records import listed_faults
 from geomocap.model.windows import windows_of
 from geomocap.progress import Progress, silent
+from geomocap.silhouettes.background import BackgroundModel
 from geomocap.version import __version__
 
 
@@ -48,6 +49,9 @@ class Job:
         `model.npz` of the subject, from another sequence.
     tell : callable
         Told in a line what the user should know.
+    backgrounds : dict of str to BackgroundModel
+        Of cameras whose images are so small that the correction of the cameras learnt them as silhouettes need them;
+        these take them out again.
     """
 
     run: Run
@@ -59,6 +63,7 @@ class Job:
     fps: float = 30.0
     model: Path | None = None
     tell: Callable[[str], object] = _say_nothing
+    backgrounds: dict[str, BackgroundModel] = field(default_factory=dict, repr=False, compare=False)
 
     def stage(
         self,

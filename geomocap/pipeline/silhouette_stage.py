@@ -12,14 +12,12 @@ from geomocap.evaluation.camera_check import BACKGROUND_FRAMES
 from geomocap.files.capture import Capture
 from geomocap.files.images import write_mask
 from geomocap.files.run import Run, stage_key
-from geomocap.pipeline.correction_stage import with_cameras
+from geomocap.pipeline.correction_stage import LearnBackground, with_cameras
 from geomocap.pipeline.job import Job
 from geomocap.scheduling import map_items
-from geomocap.silhouettes.background import BackgroundModel, model_from_frames, model_from_plate
 from geomocap.silhouettes.likelihood import Counts
 from geomocap.silhouettes.region import region_of_points
 from geomocap.silhouettes.silhouette_scene import SilhouetteScene, learning_frames
-from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 
 def silhouettes(job: Job) -> str:
@@ -62,29 +60,17 @@ def _make_silhouettes(job: Job, capture: Capture) -> int:
 def learn_scene(job: Job, capture: Capture) -> SilhouetteScene:
     """Learn what the cameras see without the subject, and how subject and background differ."""
     settings = job.config.silhouettes
-    models = list(map_items(_Learn(capture, settings), capture.cameras, job.executor, "background", job.progress, 2))
+    known = {c: job.backgrounds.pop(c) for c in capture.cameras if c in job.backgrounds}
+    missing = [c for c in capture.cameras if c not in known]
+    if missing:
+        learn = LearnBackground(capture, settings)
+        known |= zip(missing, map_items(learn, missing, job.executor, "background", job.progress, 2), strict=True)
+    models = [known[c] for c in capture.cameras]
     regions = _regions(capture)
     rig = capture.rig if capture.is_calibrated else None
     scene = SilhouetteScene.unlearnt(models, rig, settings, [regions.get(c) for c in capture.cameras])
     some = learning_frames(capture.n_frames)
     return scene.learnt(map_items(_Count(capture, scene), some, job.executor, "likelihood", job.progress, 4))
-
-
-@dataclass(frozen=True)
-class _Learn:
-    """Background model of one camera."""
-
-    capture: Capture
-    settings: SilhouetteSettings
-
-    def __call__(self, camera: str) -> BackgroundModel:
-        recorded = self.capture.sources[camera]  # also the frames before the subject came in
-        count = min(self.settings.samples, len(recorded))
-        chosen = np.unique(np.linspace(0, len(recorded) - 1, count).round().astype(int))
-        frames = [recorded.read(int(k)) for k in chosen]
-        if self.capture.has_background(camera):
-            return model_from_plate(self.capture.background(camera), frames, self.settings, camera)
-        return model_from_frames(frames, self.settings, camera)
 
 
 @dataclass(frozen=True)

@@ -68,3 +68,12 @@ def test_help_loads_nothing_that_computes(arguments):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "end"
+
+
+def test_commands_without_pictures_load_no_plots():
+    code = (
+        "import sys, geomocap.cli.jobs, geomocap.cli.stage_commands, geomocap.pipeline; "
+        "print(*[m for m in ('matplotlib', 'viz') if m in sys.modules], 'end')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["end"]

@@ -18,6 +18,7 @@ from geomocap.inspection import describe
 from geomocap.model.rig import Rig
 from geomocap.model.rig_doubts import rig_doubts
 from geomocap.pipeline import Job, agreeing, silhouettes
+from geomocap.silhouettes.background import model_from_plate
 from tests.geomocap.camera_scenes import SIZE, walk, walk_rig
 
 FRAMES = 3
@@ -125,6 +126,26 @@ def test_cameras_that_disagree_are_told_left_out_or_end_the_run(capture, tmp_pat
 
     with pytest.raises(CaptureError, match=r"cam2.*--cameras-that-disagree"):
         agreeing(job_of(capture, tmp_path / "stopped", "stop"))
+
+
+def test_backgrounds_are_learnt_once_where_images_are_small(capture, tmp_path, monkeypatch):
+    learnt = []
+
+    def counted(plate, frames, settings, camera):
+        learnt.append(camera)
+        return model_from_plate(plate, frames, settings, camera)
+
+    monkeypatch.setattr("geomocap.pipeline.correction_stage.model_from_plate", counted)
+    job = job_of(capture, tmp_path / "once", "warn")
+    silhouettes(job)
+    assert learnt == ["cam1", "cam2", "cam3", "cam4"] and not job.backgrounds
+    shutil.rmtree(tmp_path / "once" / "silhouettes")  # the correction is done: learnt anew, the same
+    before = tmp_path / "before"
+    silhouettes(job_of(capture, before, "warn"))
+    silhouettes(job_of(capture, tmp_path / "once", "warn"))
+    assert len(learnt) == 12
+    for file in (before / "silhouettes").rglob("*.png"):
+        assert file.read_bytes() == (tmp_path / "once" / file.relative_to(before)).read_bytes()
 
 
 def test_too_few_cameras_are_not_left_alone(capture, tmp_path):

@@ -158,3 +158,13 @@ def test_frames_and_points_that_make_no_skin(arm_run):
         point_spacing(np.zeros((60, 3)))
     with pytest.raises(MotionError, match="body 7 has points but no place"):
         node_of_body(motion, np.array([0, 1, 7]))
+
+
+def test_a_surface_is_the_finest_with_few_enough_triangles():
+    points = np.random.default_rng(2).normal(size=(20_000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    coarse, middle, fine = (len(surface_through(points, points, most).triangles) for most in (20_000, 60_000, 10**6))
+    assert coarse <= 20_000 < middle <= 60_000 < fine
+    assert len(surface_through(points, points, middle).triangles) == middle
+    assert len(surface_through(points, points, middle - 1).triangles) == coarse
+    assert len(surface_through(points, points, fine // 2).triangles) == middle
