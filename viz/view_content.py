@@ -23,6 +23,7 @@ from geomocap.export.skinned_mesh import SkinnedMesh
 from geomocap.files.capture import Capture
 from geomocap.files.rigs import read_rig
 from geomocap.files.run import Run
+from geomocap.files.scan_geometry import SCAN_ENDINGS
 from geomocap.files.scan_settings import ScanSettings
 from geomocap.files.scans import open_scans
 from geomocap.inspection.describe import InspectionError
@@ -219,6 +220,14 @@ def open_content(path: Path, capture: Capture | None = None) -> Content:
         for folder in (path, path / "sparse"):
             if any((folder / f"cameras{ending}").is_file() for ending in (".txt", ".bin")):
                 return of_rig(path, read_rig(folder))
+        if not any(file.suffix.lower() in SCAN_ENDINGS for file in path.iterdir()):
+            below = [
+                p.name
+                for p in sorted(path.iterdir())
+                if any((p / name).is_file() for name in ("run.toml", "capture.toml"))
+            ]
+            hint = f"; look into {' or '.join(below)}" if below else ""
+            raise InspectionError(f"{path}: neither a run, a capture, a calibration nor scans{hint}")
     elif path.suffix.lower() in ENDINGS:
         if path.suffix.lower() == ".glb":
             raise InspectionError(f"{path}: read it with data_tools.gltf_reader and give it to of_animation")
@@ -228,6 +237,9 @@ def open_content(path: Path, capture: Capture | None = None) -> Content:
             return Content(path.name, motion.n_frames, motion.fps, motion.up, motion=motion, joint_names=motion.names)
         markers = read_motion_file(path)
         return Content(path.name, len(markers.positions), markers.fps, markers.up, markers=markers)
+    elif path.suffix.lower() not in SCAN_ENDINGS:
+        known = ", ".join(sorted({*ENDINGS, *SCAN_ENDINGS}))
+        raise InspectionError(f"{path}: no kind of file that is shown; these are: {known}")
     scans = open_scans(path, ScanSettings())
 
     def points(frame: int) -> SceneSurface | None:

@@ -4,8 +4,8 @@ Axes are those of the International Society of Biomechanics: X forward, Y up alo
 2002, J. Biomech. 35, 543; Wu et al. 2005, J. Biomech. 38, 981). Where those recommendations use bony landmarks that a
 surface doesn't show, the axis is the joint's own: Z of thigh and shank is the knee's axis, Z of upper arm and forearm
 the elbow's. A part whose end has no joint of its own, because its neighbour is in one body with it, points to the
-middle of its surface, as far as the same part of the other side reaches. Feet, hands and the head have the axes of
-their neighbour in the first frame.
+middle of its surface, as far as the same part of the other side reaches. A foot's X is along its sole, in the plane in
+which the knee bends. Hands and the head have the axes of their neighbour in the first frame.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from geomocap.model.rotations import relative_turns, turn_angles
 from geomocap.model.skeleton import Skeleton
@@ -75,6 +76,10 @@ def anatomical_frames(skeleton: Skeleton, found: FoundNames) -> AnatomicalFrames
         for end in ("", "_left", "_right"):
             if part + end in bodies and neighbour + end in axes:
                 axes[part + end] = axes[neighbour + end]
+                if part == "foot" and "shank" + end in axes and found.surface is not None:
+                    pieces = [b for b, held in found.parts.items() if [labels[p] for p in held] == [part + end]]
+                    points = found.surface.points[np.isin(found.surface.bodies, pieces)]
+                    axes[part + end] = axes_on_sole(points, joints.get(part + end), axes["shank" + end])
     return AnatomicalFrames({name: bodies[name] for name in axes}, axes)
 
 
@@ -89,6 +94,37 @@ def axes_of(long: np.ndarray, across: np.ndarray, *, keep: str) -> np.ndarray:
         y = long - (long @ z) * z
         y /= np.linalg.norm(y)
     return np.stack([np.cross(y, z), y, z], axis=1)
+
+
+def axes_on_sole(points: np.ndarray, ankle: np.ndarray | None, shank: np.ndarray) -> np.ndarray:
+    """Axes X, Y, Z of a foot as columns, (3, 3): X along the sole, in the plane in which the shank swings.
+
+    The sole is the side of the foot's outline in this plane across which it is thinnest; toes are farther from the
+    ankle than the heel.
+
+    Parameters
+    ----------
+    points : (N, 3) float
+        On the foot.
+    ankle : (3,) float, optional
+        Without it, or with too few points, the axes are the shank's.
+    shank : (3, 3) float
+        Axes of the shank.
+    """
+    if ankle is None:
+        return shank
+    flat = (points - ankle) @ shank[:, :2]
+    flat = flat[flat[:, 1] < 0]  # what is above the ankle is leg
+    if len(flat) < 3 or np.linalg.matrix_rank(flat - flat[0]) < 2:
+        return shank
+    outline = flat[ConvexHull(flat).vertices]
+    sides = np.roll(outline, -1, axis=0) - outline
+    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+    across = np.ptp(outline @ np.column_stack([-sides[:, 1], sides[:, 0]]).T, axis=0)
+    sole = sides[np.argmin(across)]
+    sole = sole * (1.0 if sole @ flat.mean(axis=0) > 0 else -1.0)
+    x = shank[:, :2] @ sole
+    return np.stack([x, np.cross(shank[:, 2], x), shank[:, 2]], axis=1)
 
 
 def _pair(joints: dict[str, np.ndarray], part: str) -> np.ndarray | None:

@@ -79,6 +79,8 @@ def _content(path: Path, metres_per_unit: float = 1.0) -> Content:
         from data_tools.gltf_reader import load_gltf
 
         return of_animation(path.name, load_gltf(path))
+    if path.name in ("run.toml", "capture.toml"):
+        path = path.parent
     rig = foreign_calibration(path, metres_per_unit)
     if rig is not None:
         return of_rig(path, rig)

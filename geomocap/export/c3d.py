@@ -16,7 +16,7 @@ from geomocap.export.conventions import C3D, UNITS_PER_METRE, Axis
 from geomocap.export.export_errors import MotionError, require
 from geomocap.export.markers import Markers
 from geomocap.export.motion_tree import MotionTree
-from geomocap.files.atomic import write_atomic
+from geomocap.files.atomic import by_library, write_atomic
 from geomocap.version import __version__
 
 FINEST_RESIDUAL = 0.01  # mm; residuals are bytes, multiples of POINT:SCALE
@@ -67,7 +67,7 @@ def write_c3d(path: Path, markers: Markers, motion: MotionTree | None = None) ->
         file["data"]["rotations"] = _transforms(motion)
         _add_texts(file, "ROTATION", "LABELS", motion.names)
         file.add_parameter("ROTATION", "DESCRIPTIONS", ["world from body since the first frame, mm"] * motion.n_nodes)
-    write_atomic(path, lambda p: file.write(str(p)), lambda p: _is_whole(p, markers, motion))
+    write_atomic(path, by_library(lambda p: file.write(str(p))), lambda p: _is_whole(p, markers, motion))
 
 
 def _is_whole(path: Path, markers: Markers, motion: MotionTree | None) -> bool:

@@ -23,7 +23,7 @@ import numpy as np
 from geomocap.export.export_errors import MotionError, require
 from geomocap.export.markers import Markers
 from geomocap.export.motion_tree import MotionTree
-from geomocap.files.atomic import write_atomic, write_text
+from geomocap.files.atomic import by_library, write_atomic, write_text
 from geomocap.model.rotations import turn_angles, zxy_angles
 
 
@@ -82,4 +82,4 @@ def write_parquet(path: Path, table: dict[str, np.ndarray]) -> None:
     arrow = require("pyarrow", extra="parquet", purpose="Parquet files")
     parquet = require("pyarrow.parquet", extra="parquet", purpose="Parquet files")
     columns = {name: arrow.array(c, from_pandas=True) for name, c in table.items()}
-    write_atomic(path, lambda p: parquet.write_table(arrow.table(columns), p))
+    write_atomic(path, by_library(lambda p: parquet.write_table(arrow.table(columns), p)))

@@ -15,7 +15,7 @@ from geomocap.export.export_errors import require
 from geomocap.export.glb import linear_light
 from geomocap.export.motion_tree import MotionTree
 from geomocap.export.skinned_mesh import INFLUENCES, SkinnedMesh, bone_mesh
-from geomocap.files.atomic import write_atomic
+from geomocap.files.atomic import by_library, write_atomic
 from geomocap.model.rotations import quaternions
 
 ROOT, SKELETON, ANIMATION, SURFACE = "/subject", "/subject/skeleton", "/subject/skeleton/motion", "/subject/surface"
@@ -38,7 +38,7 @@ def write_usd(path: Path, motion: MotionTree, mesh: SkinnedMesh | None = None) -
         If usd-core isn't installed.
     """
     require("pxr.Usd", extra="usd", purpose="USD files")
-    write_atomic(path, lambda p: _write(p, motion, mesh or bone_mesh(motion)))
+    write_atomic(path, by_library(lambda p: _write(p, motion, mesh or bone_mesh(motion))))
 
 
 def _write(path: Path, motion: MotionTree, mesh: SkinnedMesh) -> None:

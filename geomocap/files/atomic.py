@@ -14,6 +14,7 @@ import platform
 import re
 import secrets
 import shutil
+import tempfile
 import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
@@ -81,6 +82,22 @@ def write_text(path: Path, text: str, *, lasting: bool = True) -> None:
         what = error.object[error.start : error.end].encode("utf-8", "backslashreplace").decode()
         raise RunError(f"{path}: can't name a path with {what}, which isn't UTF-8; rename that folder") from None
     write_bytes(path, data, lasting=lasting)
+
+
+def by_library(write: Callable[[Path], object]) -> Callable[[Path], object]:
+    """Return what writes by a library that can only name UTF-8: elsewhere, where a folder is called otherwise."""
+
+    def named(path: Path) -> object:
+        try:
+            str(path).encode()
+        except UnicodeEncodeError:
+            with tempfile.TemporaryDirectory() as folder:
+                written = write(Path(folder) / path.name)
+                shutil.copyfile(Path(folder) / path.name, path)
+                return written
+        return write(path)
+
+    return named
 
 
 def copy_whole(source: Path, target: Path) -> None:

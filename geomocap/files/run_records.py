@@ -66,8 +66,12 @@ def read_run_record(run: Path) -> dict[str, Any]:
 
 
 def source_places(run: Path, path: Path) -> dict[str, str]:
-    """Return what a run says of where its source is: from anywhere, and from the run, if both are moved together."""
-    return {"path": os.path.abspath(path), "from_run": os.path.relpath(path, run)}
+    """Return what a run says of where its source is: from anywhere, and from the run, if both are moved together.
+
+    A path that isn't UTF-8 can't stand in TOML as it is: of folders of such names the second may be one.
+    """
+    places = {"path": os.path.abspath(path), "from_run": os.path.relpath(path, run)}
+    return {what: os.fsencode(place).decode("utf-8", "backslashreplace") for what, place in places.items()}
 
 
 def source_path(run: Path, source: Mapping[str, Any]) -> Path:

@@ -11,6 +11,8 @@ import tomli_w
 from data_tools import calibration_files as formats
 from geomocap.cli.view_command import _content
 from geomocap.errors import GeomocapError
+from geomocap.files.images import write_image
+from geomocap.files.rigs import write_rig
 from tests.small_files import mesh, rig
 
 WRITERS = {
@@ -72,3 +74,22 @@ def test_what_is_no_calibration_is_told_in_one_line(name, tmp_path):
     with pytest.raises(GeomocapError, match=name) as told:
         _content(tmp_path / name)
     assert "\n" not in str(told.value)
+
+
+def test_what_is_not_shown_is_told_with_what_is(tmp_path):
+    (tmp_path / "motion.urdf").write_text("<robot/>")
+    with pytest.raises(GeomocapError, match=r"motion\.urdf: no kind of file that is shown; these are: .*\.bvh.*\.ply"):
+        _content(tmp_path / "motion.urdf")
+    (tmp_path / "take" / "run").mkdir(parents=True)
+    (tmp_path / "take" / "run" / "run.toml").write_text("")
+    with pytest.raises(GeomocapError, match=r"take: neither a run, .* nor scans; look into run"):
+        _content(tmp_path / "take")
+
+
+def test_a_capture_is_shown_by_its_file_too(tmp_path):
+    write_rig(tmp_path / "sparse", rig(2))
+    (tmp_path / "capture.toml").write_text('name = "x"\nfps = 10.0\nup = "z"\n')
+    for camera in rig(2).names:
+        write_image(tmp_path / "images" / camera / "000000.png", np.zeros((240, 320, 3), np.uint8))
+    content = _content(tmp_path / "capture.toml")
+    assert content.rig is not None and content.rig.names == rig(2).names

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geomocap.angles.anatomical_frames import anatomical_frames
+from geomocap.angles.anatomical_frames import anatomical_frames, axes_on_sole
 from geomocap.angles.joint_angles import joint_angles, turn_covariances
 from geomocap.export.angle_files import mot_text
 from geomocap.model.rotations import rotation_about
@@ -124,3 +124,21 @@ def test_a_motion_file_says_its_size_and_unit():
     assert {"nRows=2", "nColumns=3", "inDegrees=yes"} <= set(lines)
     assert lines[lines.index("endheader") + 1].split("\t") == ["time", "a", "b"]
     assert [float(v) for v in lines[-1].split("\t")] == [0.1, 3, 4]
+
+
+@pytest.mark.parametrize("pointed_deg", [-20.0, 0.0, 35.0])
+def test_a_foot_lies_along_its_sole(pointed_deg):
+    rng = np.random.default_rng(0)
+    corners = np.array([[-0.06, -0.08], [0.20, -0.08], [0.20, -0.05], [0.02, 0.0], [-0.05, 0.0]])  # heel, toes, instep
+    shares = rng.dirichlet(np.ones(len(corners)) * 0.3, 4000)
+    inside = np.column_stack([shares @ corners, rng.uniform(-0.04, 0.04, 4000)])
+    shank = Rotation.random(random_state=1).as_matrix()
+    turn = Rotation.from_euler("z", -pointed_deg, degrees=True).as_matrix()
+    leg = np.column_stack([rng.uniform(-0.05, 0.05, 500), rng.uniform(0.001, 0.1, 500), np.zeros(500)])
+    ankle = np.array([0.3, -0.2, 0.1])
+    foot = np.concatenate([inside @ turn.T, leg]) @ shank.T + ankle
+    axes = axes_on_sole(foot, ankle, shank)
+    np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
+    found = Rotation.from_matrix(shank.T @ axes).as_euler("zxy", degrees=True)
+    np.testing.assert_allclose(found, [-pointed_deg, 0, 0], atol=3)
+    assert axes_on_sole(foot[:0], ankle, shank) is shank and axes_on_sole(foot, None, shank) is shank

@@ -24,7 +24,15 @@ from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.export.tables import motion_table, write_csv, write_parquet
 from geomocap.export.trc import write_trc
 from geomocap.export.usd import write_usd
-from geomocap.files.atomic import copy_whole, remove_remains, temporary_beside, write_folder, write_text
+from geomocap.files.atomic import (
+    by_library,
+    copy_whole,
+    remove_remains,
+    temporary_beside,
+    write_atomic,
+    write_folder,
+    write_text,
+)
 from geomocap.files.frame_files import write_points, write_voxels
 from geomocap.files.images import write_image, write_mask
 from geomocap.files.npz import write_npz
@@ -166,3 +174,14 @@ def test_temporary_names_are_unique_and_go_when_their_process_has_ended(tmp_path
     assert not left.exists() and mine.exists()
     remove_remains([tmp_path], alone=True)
     assert sorted(p.name for p in tmp_path.iterdir()) == [".hidden.tmp.bvh", "motion.bvh"]
+
+
+def test_libraries_that_name_utf_8_only_write_into_any_folder(tmp_path):
+    def library(path: Path) -> None:
+        str(path).encode()
+        path.write_text("whole")
+
+    for name in ("plain", os.fsdecode(b"\xff")):
+        (tmp_path / name).mkdir()
+        write_atomic(tmp_path / name / "a.txt", by_library(library))
+        assert [f.read_text() for f in (tmp_path / name).iterdir()] == ["whole"]
