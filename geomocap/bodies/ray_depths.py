@@ -73,9 +73,9 @@ def find_bodies_and_depths(
     """Find bodies, from their motions the depths of what single cameras see, and bodies from these; again and again.
 
     Wrong depths make a surface that no rigid bodies move. So of the first bodies and those of `depth_rounds` further
-    rounds those are taken whose paths show the least noise, the latest of equals; with silhouettes, which tell depths
-    without bodies' help, the last. Parameters and errors are those of `find_motion_bodies`; `outlines` are those of
-    the cameras. Also returns the paths that the bodies are of.
+    rounds those are taken whose paths show the least noise, the latest of equals; with `outlines`, the silhouettes of
+    these cameras, the first count only if there are no others. Other parameters and errors are those of
+    `find_motion_bodies`. Also returns the paths that the bodies are of.
     """
     settings = settings or MotionBodiesSettings()
     rounds = settings.depth_rounds if paths.ray is not None and paths.ray.any() else 0
@@ -86,7 +86,7 @@ def find_bodies_and_depths(
     for k in range(rounds):
         paths = settle_depths(paths, bodies, outlines)
         bodies = find_motion_bodies(paths, settings)
-        if outlines is not None or bodies.noise <= best[0].noise:
+        if bodies.noise <= best[0].noise or (outlines is not None and k == 0):
             best = bodies, paths
         progress(_STAGE, 2 + k, 1 + rounds)
     return best

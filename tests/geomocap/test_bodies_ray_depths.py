@@ -11,10 +11,12 @@ from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.bodies.motion_bodies import MotionBodies, find_motion_bodies
 from geomocap.bodies.ray_depths import find_bodies_and_depths, place_samples, settle_depths
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.outlines import Outlines
 from geomocap.model.small_systems import solve_symmetric
 from tests.geomocap.moving_chains import chain, same_partition, seen_by_single_cameras
 
 DEPTH_FRACTION = 0.05
+NOTHING = np.zeros((1, 1, 1, 1), np.uint8)
 
 
 def test_small_systems_are_solved_as_numpy_does():
@@ -155,6 +157,33 @@ def test_bodies_of_the_paths_with_the_least_noise_are_taken(monkeypatch, alone, 
     best, paths = find_bodies_and_depths(alone, settings, lambda *step: reported.append(step))
     assert best is found[2][0] and paths is found[2][1]
     assert reported == [("bodies", k, 4) for k in range(5)]
+    # silhouettes tell depths that the first bodies don't have, so these don't count
+    noises, outlines = iter([1e-3, 3e-3, 2e-3, 4e-3]), Outlines(np.arange(1), np.zeros((1, 3, 4)), NOTHING)
+    found.clear()
+    assert find_bodies_and_depths(alone, settings, outlines=outlines)[0] is found[2][0]
+
+
+def test_where_silhouettes_say_nothing_depths_are_those_of_the_motion(three, alone, bodies):
+    anywhere = Outlines(np.arange(2), np.zeros((1, 3, 4)), np.zeros((2, 1, 4, 4), np.uint8))
+    settled = settle_depths(alone, bodies, anywhere).positions
+    assert_allclose(settled, settle_depths(alone, bodies).positions, atol=0.005)
+
+
+def test_a_body_that_leaves_the_silhouettes_is_not_chosen(three, alone, bodies):
+    """A camera from above whose image is empty but where the first body's samples are in the frames."""
+    first = int(bodies.label[three.body == 0][0])
+    P = np.array([[[100.0, 0, 0, 500], [0, 100.0, 0, 500], [0, 0, 0, 1.0]]])  # parallel rays along z
+    empty = np.ones((three.positions.shape[1], 1, 1000, 1000), np.uint8)
+    for t in range(len(empty)):
+        for x, y in np.rint(100.0 * three.positions[three.body == 0, t, :2] + 500).astype(int):
+            empty[t, 0, y - 3 : y + 4, x - 3 : x + 4] = 0
+    outlines = Outlines(np.arange(len(empty)), P, empty)
+    motions = bodies.rotations.swapaxes(0, 1), bodies.translations.swapaxes(0, 1)
+    outside = [ray_depths._place(alone, r[None], t[None], outlines).outside for r, t in zip(*motions, strict=True)]
+    own = three.body == 0
+    missed = [float(np.median(o[own])) for o in outside]
+    assert missed[first] < 0.05 < max(missed), missed
+    assert np.argmin(missed) == first
 
 
 def test_depths_repeat_bit_for_bit(alone, bodies):
