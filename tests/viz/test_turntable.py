@@ -157,7 +157,7 @@ def test_without_a_skeleton_nothing_turns(scene, tmp_path):
 def page_file(scene: Made, turns: Turntable, tmp_path_factory: pytest.TempPathFactory) -> Path:
     results = Results(scene.run, scene.capture)
     picture = still(results, stage(results), 3, (480, 300))
-    parts = (section("Result", [turning(picture, "The subject", "How to use it.")]),)
+    parts = (section("Result", [turning(picture, "The subject")]),)
     path = tmp_path_factory.mktemp("page") / "report.html"
     path.write_text(render_html(Report(HOSTILE, HOSTILE, sections=parts, turntable=turns)), encoding="utf-8")
     return path
