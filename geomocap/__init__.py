@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from geomocap.files.scans import ScanSettings, open_scans
     from geomocap.model.frame_geometry import Voxels
     from geomocap.model.motion_paths import MotionPaths
+    from geomocap.model.outlines import Outlines
     from geomocap.model.rig import Rig
     from geomocap.motion import Motion, MotionSettings, find_motion
     from geomocap.patches.point_tracking import track
@@ -50,6 +51,7 @@ _HOMES = {  # where each public name is defined
     "Motion": "geomocap.motion",
     "MotionPaths": "geomocap.model.motion_paths",
     "MotionSettings": "geomocap.motion",
+    "Outlines": "geomocap.model.outlines",
     "Rig": "geomocap.model.rig",
     "ScanSettings": "geomocap.files.scans",
     "SubjectModel": "geomocap.subject.subject_model",
@@ -75,6 +77,7 @@ __all__ = [
     "Motion",
     "MotionPaths",
     "MotionSettings",
+    "Outlines",
     "Rig",
     "ScanSettings",
     "SubjectModel",

@@ -81,7 +81,7 @@ def _noted() -> dict[str, tuple[str, list[str]]]:
     """What was found of modules when the sources were as they are now: compiling them all takes two seconds."""
     try:
         return dict(json.loads(_note_file().read_bytes()))
-    except (OSError, ValueError):
+    except (OSError, ValueError, TypeError):
         return {}
 
 

@@ -14,7 +14,9 @@ from geomocap.model.outlines import Outlines
 from geomocap.scheduling import spread
 
 _HALVINGS = 3  # of a step, where the front is in one
-MAY_MISS = 0.05  # fraction of the views that a place of the hull may be outside of
+# Fraction of the views that a place of the hull may be outside of. Depths of a man seen by four cameras erred by 21 mm
+# (90 %) with 0.05, by 27 mm with 0.1, and by 26 mm with 0.02 and silhouettes a pixel wider.
+MAY_MISS = 0.05
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

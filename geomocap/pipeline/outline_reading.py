@@ -11,7 +11,7 @@ from geomocap.model.outlines import Outlines
 from geomocap.pipeline.job import Job
 
 _FRAMES = 40  # evenly spread: with four cameras a hundred and sixty views
-_LONGEST_SIDE = 640  # pixels that are enough for depths
+_LONGEST_SIDE = 640  # pixels, about: those that depths were measured with
 
 
 def outlines_of(job: Job) -> Outlines | None:

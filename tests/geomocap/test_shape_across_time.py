@@ -110,7 +110,7 @@ def test_fronts_of_all_frames_are_the_surface_though_a_rod_is_before_it(scene):
     rest, inward = on_the_ball()
     for moved in (-0.3, -0.1, 0.1):  # before the surface, where the rod is, and within
         shift = hull_fronts(rest + moved * inward, inward, turns[None], shifts[None], outlines, STEP, REACH)[0]
-        assert np.median(np.abs(moved + shift)) < 0.025
+        assert np.median(np.abs(moved + shift)) < 0.025  # two pixels
     still = Outlines(outlines.frames[:1], outlines.projections, outlines.empty[:1])
     alone = hull_fronts(rest, inward, turns[None], shifts[None], still, STEP, REACH)[0]
     assert np.median(-alone) > 0.1  # the hull of one frame has the rod's depth
@@ -123,8 +123,8 @@ def test_silhouettes_that_miss_the_subject_altogether_are_at_fault_themselves(sc
     empty[[1, 7, 9]] = 1
     broken = Outlines(outlines.frames, outlines.projections, empty)
     shift, missed = hull_fronts(rest - 0.1 * inward, inward, turns[None], shifts[None], broken, STEP, REACH)
-    assert np.median(np.abs(shift - 0.1)) < 0.04
-    assert missed.min() >= 0.25
+    assert np.median(np.abs(shift - 0.1)) < 0.04  # three pixels, as fewer views are left
+    assert missed.min() >= 0.25  # three of twelve frames
 
 
 def test_each_place_may_move_on_its_own(scene):
@@ -148,3 +148,10 @@ def test_a_motion_that_is_not_its_own_carries_a_place_out_of_the_silhouettes(sce
     away = shifts + np.linspace(0, 1.5, FRAMES)[:, None] * [0, 0, 1.0]
     other = hull_fronts(rest, inward, turns[None], away[None], outlines, STEP, REACH)[1]
     assert own.max() <= MAY_MISS < 0.3 < other.min()
+
+
+def test_frames_that_the_paths_do_not_have_are_refused(scene):
+    outlines = scene[0]
+    outlines.check_frames(FRAMES)
+    with pytest.raises(GeometryError, match="frames 0 to 11, but the paths have 11; number them"):
+        outlines.check_frames(FRAMES - 1)

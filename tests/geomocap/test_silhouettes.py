@@ -161,9 +161,8 @@ def test_frames_that_agree_with_the_plate_are_added_as_in_numpy() -> None:
 def test_misses_are_those_of_the_reference() -> None:
     rng = np.random.default_rng(4)
     image, mean = rng.integers(0, 256, (50, 3), dtype=np.uint8), rng.uniform(0, 255, (20, 3)).astype(np.float32)
-    pixels = rng.choice(50, 20, replace=False)
+    pixels, misses = rng.choice(50, 20, replace=False), np.full((20, 4, 3), -1.0)
     gain, offset = rng.uniform(0.9, 1.1, 3), rng.normal(size=3)
-    misses = np.full((20, 4, 3), -1.0)
     absolute_misses(image, pixels, mean, gain, offset, 2, misses)
     np.testing.assert_array_equal(misses[:, 2], np.abs(image[pixels] - (gain * mean + offset)))
     assert (misses[:, [0, 1, 3]] == -1).all()
