@@ -64,7 +64,7 @@ def adjust_depths(tracks: Trajectories) -> Trajectories:
     if not alone.any():
         return tracks
     depth_std = float(np.sqrt(3) * np.median(tracks.sigma[alone]))
-    near = nearest_companions(tracks.positions, has, _COMPANIONS)
+    near, _ = nearest_companions(tracks.positions, has, _COMPANIONS)
     first, second = np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()
     first, second = first[first != second], second[first != second]
     place = np.nan_to_num(tracks.positions)

@@ -68,6 +68,18 @@ def seen_by_single_cameras(scene: Chain, depth_std: float, seed: int = 0) -> tup
     return scene.positions + noise + off[:, :, None] * ray, ray
 
 
+def seen_while_it_turns(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions (N, T, 3) of a chain that turns about its length as a whole, NaN on its far side; all; bodies (N,)."""
+    scene = chain(3, frames=48, samples=200, seed=seed)
+    angle = np.linspace(0, 1.2 * np.pi, 48)
+    turns = Rotation.from_rotvec(np.outer(angle, [1.0, 0.0, 0.0])).as_matrix()
+    true = np.einsum("tij,ntj->nti", turns, scene.positions)
+    side = np.arctan2(1.2 * scene.positions[:, 0, 2], scene.positions[:, 0, 1])
+    near = np.cos(side[:, None] + angle) > 0.1
+    noisy = true + np.random.default_rng(seed).normal(scale=1e-3, size=true.shape)
+    return np.where(near[..., None], noisy, np.nan), true, scene.body
+
+
 def same_partition(found: np.ndarray, true: np.ndarray) -> float:
     """Fraction of samples whose body is the one that covers their true body best, one to one at best."""
     table = np.zeros((true.max() + 1, found.max() + 1))

@@ -21,7 +21,7 @@ from geomocap.skeleton.common_points import common_point
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
 from geomocap.skeleton.refinement import refine_skeleton
 from geomocap.trajectories.completion import complete_tracks
-from tests.geomocap.moving_chains import chain, same_partition, seen_by_single_cameras
+from tests.geomocap.moving_chains import chain, same_partition, seen_by_single_cameras, seen_while_it_turns
 
 
 @pytest.fixture(scope="module")
@@ -367,6 +367,19 @@ def test_completion_carries_gaps_with_the_neighbours(three):
     assert np.median(miss[::5, 6:18]) < 0.01
     assert (certainty[::5, 6:18] < 1).all() and (certainty[::5, 6:18] > 0).all()
     np.testing.assert_array_equal(filled[1::5], three.positions[1::5])
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_what_goes_out_of_sight_stays_with_its_body(seed):
+    seen, true, body = seen_while_it_turns(seed)
+    gaps = np.isnan(seen[..., 0])
+    assert gaps.mean() > 0.5
+    filled, _ = complete_tracks(MotionPaths(seen))
+    miss = np.linalg.norm(filled - true, axis=2)[gaps]
+    assert np.median(miss) < 0.01 and np.quantile(miss, 0.9) < 0.05  # of boxes 0.4 m long
+    found = find_motion_bodies(MotionPaths(seen))
+    assert found.body_count == 3
+    assert same_partition(found.label, body) > 0.99
 
 
 def test_precision_beyond_what_surfaces_give_hardly_counts():
