@@ -161,8 +161,8 @@ def complete_tracks(paths: MotionPaths) -> tuple[np.ndarray, np.ndarray]:
     """Positions of all samples in all frames.
 
     A sample that is not seen is carried from the frame before (and from the one after) by the rigid motion of its
-    companions: samples that are near and keep their distance, these most. Both directions are averaged with weights that fade from where
-    the sample was seen last; what companions never reach stands still.
+    companions: samples that are near and keep their distance, these most. Both directions are averaged with weights
+    that fade from where the sample was seen last; what companions never reach stands still.
 
     Parameters
     ----------

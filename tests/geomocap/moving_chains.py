@@ -75,7 +75,7 @@ def seen_while_it_turns(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     turns = Rotation.from_rotvec(np.outer(angle, [1.0, 0.0, 0.0])).as_matrix()
     true = np.einsum("tij,ntj->nti", turns, scene.positions)
     side = np.arctan2(1.2 * scene.positions[:, 0, 2], scene.positions[:, 0, 1])
-    near = np.cos(side[:, None] + angle) > 0.1
+    near = np.cos(side[:, None] + angle) > -0.2
     noisy = true + np.random.default_rng(seed).normal(scale=1e-3, size=true.shape)
     return np.where(near[..., None], noisy, np.nan), true, scene.body
 

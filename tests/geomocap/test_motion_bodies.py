@@ -369,11 +369,11 @@ def test_completion_carries_gaps_with_the_neighbours(three):
     np.testing.assert_array_equal(filled[1::5], three.positions[1::5])
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", [0, 1, 3])
 def test_what_goes_out_of_sight_stays_with_its_body(seed):
     seen, true, body = seen_while_it_turns(seed)
     gaps = np.isnan(seen[..., 0])
-    assert gaps.mean() > 0.5
+    assert gaps.mean() > 0.4
     filled, _ = complete_tracks(MotionPaths(seen))
     miss = np.linalg.norm(filled - true, axis=2)[gaps]
     assert np.median(miss) < 0.01 and np.quantile(miss, 0.9) < 0.05  # of boxes 0.4 m long
