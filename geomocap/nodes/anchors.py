@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from geomocap.model.motion_paths import DEPTH_FRACTION, sure_part
 from geomocap.nodes.node_graph import NodeGraph
 
 
@@ -18,12 +19,20 @@ class Anchors:
     ----------
     positions : (P, T, 3) float
         In the unit that nodes are followed in; NaN where not known.
-    sigma : (P, T) float
+    sigma : (P, T) float, optional
         Standard deviation of a coordinate, in that unit.
+    ray : (P, T, 3) float, optional
+        Along which positions are unsure, see `MotionPaths`.
     """
 
     positions: np.ndarray
-    sigma: np.ndarray
+    sigma: np.ndarray | None = None
+    ray: np.ndarray | None = None
+
+    @classmethod
+    def none(cls, frames: int) -> Anchors:
+        """No points at all."""
+        return cls(np.zeros((0, frames, 3)))
 
 
 @dataclass(frozen=True)
@@ -40,39 +49,35 @@ class AnchorPoints:
         Where the mark is in the frame.
     precision : (K,) float
         One over the variance of a coordinate, or 1 where that isn't known.
+    ray : (K, 3) float, optional
+        Along which the place is unsure.
     """
 
     sample: np.ndarray
     offset: np.ndarray
     position: np.ndarray
     precision: np.ndarray
+    ray: np.ndarray | None = None
 
     @classmethod
-    def of(
-        cls, graph: NodeGraph, homes: np.ndarray, positions: np.ndarray, sigma: np.ndarray | None = None
-    ) -> AnchorPoints:
-        """Hang marks on a graph.
-
-        Parameters
-        ----------
-        graph : NodeGraph
-        homes, positions : (P, 3) float, metres
-            In the reference frame and in the frame; NaN where not known.
-        sigma : (P,) float, optional
-            Standard deviation of a coordinate of the positions.
-        """
+    def of(cls, graph: NodeGraph, homes: np.ndarray, anchors: Anchors, frame: int) -> AnchorPoints:
+        """Hang the marks of a frame on a graph; `homes` (P, 3) are their places in the reference frame or NaN."""
+        positions = anchors.positions[:, frame]
         known = np.isfinite(homes[:, 0]) & np.isfinite(positions[:, 0])
         home = homes[known]
         distance, sample = cKDTree(graph.samples).query(home)
         near = distance < graph.spacing
         sample = sample[near].astype(int)
-        precision = np.ones(len(sample)) if sigma is None else 1 / sigma[known][near] ** 2
-        return cls(sample, graph.samples[sample] - home[near], positions[known][near], precision)
+        sigma, ray = (None if a is None else a[known, frame][near] for a in (anchors.sigma, anchors.ray))
+        precision = np.ones(len(sample)) if sigma is None else 1 / sigma**2
+        return cls(sample, graph.samples[sample] - home[near], positions[known][near], precision, ray)
 
     def add_to(
         self, A: np.ndarray, b: np.ndarray, graph: NodeGraph, x: np.ndarray, R: np.ndarray, weight: float, scale: float
     ) -> None:
         """Add what the marks pull at the samples to A (S, 3, 3) and b (S, 3), in place; robustly, by Geman and McClure.
+
+        What is missed along a ray counts a tenth: there the surface knows more.
 
         Parameters
         ----------
@@ -85,9 +90,13 @@ class AnchorPoints:
         """
         y, turn = carried(graph, self.sample, x, R)
         error = y - self.position - np.einsum("kij,kj->ki", turn, self.offset)
-        w = weight * self.precision / (1 + (error**2).sum(axis=1) / scale**2) ** 2
-        np.add.at(A, self.sample, w[:, None, None] * np.eye(3))
-        np.add.at(b, self.sample, w[:, None] * error)
+        miss = sure_part(error, self.ray)
+        w = weight * self.precision / (1 + (miss**2).sum(axis=1) / scale**2) ** 2
+        pull = np.broadcast_to(np.eye(3), (len(w), 3, 3))
+        if self.ray is not None:
+            pull = pull - (1 - DEPTH_FRACTION**2) * self.ray[:, :, None] * self.ray[:, None]
+        np.add.at(A, self.sample, w[:, None, None] * pull)
+        np.add.at(b, self.sample, w[:, None] * np.einsum("kij,kj->ki", pull, error))
 
 
 def carried(graph: NodeGraph, sample: np.ndarray, x: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

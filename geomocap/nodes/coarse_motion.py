@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from geomocap.nodes.anchors import AnchorPoints, find_homes
+from geomocap.nodes.anchors import AnchorPoints, Anchors, find_homes
 from geomocap.nodes.correspondences import Pull, Target, pull
 from geomocap.nodes.deformation import BlockPattern, block_pattern, step
 from geomocap.nodes.extremities import match_ends
@@ -108,9 +108,9 @@ class CoarseModel:
         points = frame.target.points.turned_like(*self.graph.deform(state.x, state.R), 0.5 * self.graph.spacing)
         return replace(frame, target=replace(frame.target, points=points))
 
-    def marked(self, frame: CoarseTarget, homes: np.ndarray, positions: np.ndarray) -> CoarseTarget:
-        """Add to a frame what is known of points with homes (P, 3) and positions (P, 3), NaN where not known."""
-        return replace(frame, marks=AnchorPoints.of(self.graph, homes, positions)) if len(homes) else frame
+    def marked(self, target: CoarseTarget, homes: np.ndarray, anchors: Anchors, frame: int) -> CoarseTarget:
+        """Add to a frame what is known of points with homes (P, 3), NaN where not known."""
+        return replace(target, marks=AnchorPoints.of(self.graph, homes, anchors, frame)) if len(homes) else target
 
     def cost(self, state: State, expected: State) -> float:
         """Cost of a state, and of being elsewhere than expected: limbs that seem to have changed places have not."""
@@ -191,7 +191,7 @@ class CoarseModel:
 
 
 def follow(
-    model: CoarseModel, frames: list[CoarseTarget], reference: int, way: int, anchors: np.ndarray | None = None
+    model: CoarseModel, frames: list[CoarseTarget], reference: int, way: int, anchors: Anchors | None = None
 ) -> tuple[list[State], np.ndarray]:
     """Follow the surface from the reference frame on, forwards (way 1) or backwards (way −1).
 
@@ -200,8 +200,8 @@ def follow(
     model : CoarseModel
     frames : list of CoarseTarget
     reference, way : int
-    anchors : (P, T, 3) float, metres, optional
-        Trajectories; NaN where not measured. Each one holds the surface from the frame on in which it is first met.
+    anchors : Anchors, optional
+        Trajectories. Each one holds the surface from the frame on in which it is first met.
 
     Returns
     -------
@@ -211,14 +211,14 @@ def follow(
         Where the anchors are in the reference frame; NaN: never met.
     """
     states = [model.start()]
-    anchors = np.zeros((0, len(frames), 3)) if anchors is None else anchors
-    homes = anchors[:, reference].copy()
+    anchors = anchors or Anchors.none(len(frames))
+    homes = anchors.positions[:, reference].copy()
     end = len(frames) if way > 0 else -1
     for k in range(reference + way, end, way):
-        frame = model.marked(frames[k], homes, anchors[:, k])
+        frame = model.marked(frames[k], homes, anchors, k)
         states.append(model.next_state(frame, states[-1], states[-2] if len(states) > 1 else None))
         new = np.isnan(homes[:, 0])
-        homes[new] = find_homes(model.graph, states[-1].x, states[-1].R, anchors[new, k])
+        homes[new] = find_homes(model.graph, states[-1].x, states[-1].R, anchors.positions[new, k])
     return states, homes
 
 

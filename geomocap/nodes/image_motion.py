@@ -109,7 +109,7 @@ class ImageMotion:
             starts = [_carried(geometric[t - way], geometric[t], states[-1], g.spacing)]
             if len(states) > 1:
                 starts.insert(0, _continued(states[-2], states[-1]))
-            marks = AnchorPoints.of(g, homes, known.positions[:, t], known.sigma[:, t])
+            marks = AnchorPoints.of(g, homes, known, t)
             found = [self._fit(frames[t], images, earlier, marks, start, 0) for start in starts]
             best = found[0][0] if len(found) < 2 else self._better(frames[t], found)
             states.append(self._fit(frames[t], images, earlier, marks, best, 1)[0])

@@ -147,11 +147,11 @@ class NodeModel:
         self.carrier, self.carrier_weights = carried.binding[where], carried.weights[where]
 
     def refine(
-        self, target: Target, coarse: State, homes: np.ndarray, anchors: np.ndarray
+        self, target: Target, coarse: State, homes: np.ndarray, anchors: Anchors, frame: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Fit the fine graph to a frame from the coarse state; positions, rotations, covariances, which are lost.
 
-        `homes` and `anchors` (P, 3) are where points are in the reference frame and in this one, NaN where not known.
+        `homes` (P, 3) are where the anchors are in the reference frame, NaN where not known.
         """
         arm = self.graph.nodes[:, None] - self.coarse.graph.nodes[self.carrier]
         moved = coarse.x[self.carrier] + np.matmul(coarse.R[self.carrier], arm[..., None])[..., 0]
@@ -160,7 +160,7 @@ class NodeModel:
         R = nearest_rotation((w[..., None, None] * coarse.R[self.carrier]).sum(axis=1))
         h, s, g = self.graph.spacing, self.settings, self.graph
         target = replace(target, points=target.points.turned_like(*g.deform(x, R), 0.5 * h))
-        marks = AnchorPoints.of(g, homes, anchors)
+        marks = AnchorPoints.of(g, homes, anchors, frame)
         for scale, stiffness in FINE:
             c = max(scale * h, 1.5 * self.spacing)
             y, normals = g.deform(x, R)
@@ -270,19 +270,19 @@ def track_nodes(
         )
 
     coarse = list(map_items(coarsen, list(range(n_frames)), executor, "ends of limbs", progress))
-    known = np.zeros((0, n_frames, 3)) if anchors is None else unit.to(anchors.positions)
+    known = Anchors.none(n_frames) if anchors is None else Anchors(unit.to(anchors.positions), ray=anchors.ray)
     (ahead, homes_ahead), (back, homes_back) = map_items(
         lambda way: follow(model.coarse, coarse, reference, way, known), [1, -1], executor, "coarse motion", progress
     )
     states = back[:0:-1] + ahead
     homes = [homes_back if frame < reference else homes_ahead for frame in range(n_frames)]
-    marked = [model.coarse.marked(coarse[k], homes[k], known[:, k]) for k in range(n_frames)]
+    marked = [model.coarse.marked(coarse[k], homes[k], known, k) for k in range(n_frames)]
     for way in (-1, 1):
         states = mend(model.coarse, marked, states, reference, way)
 
     def refine(frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         target = Target(frames[frame], scales, settings.normal_weight)
-        return model.refine(target, states[frame], homes[frame], known[:, frame])
+        return model.refine(target, states[frame], homes[frame], known, frame)
 
     fine = list(map_items(refine, list(range(n_frames)), executor, "nodes", progress))
     blind = None
@@ -292,7 +292,7 @@ def track_nodes(
         measured = _measured(anchors, known, unit)
         fine = _followed_in_images(model, frames, geometric, reference, measured, images, unit, executor, progress)
     tracks = _tracks(model, fine, reference, unit)
-    if settings.part_rounds and not len(known) and images is None:
+    if settings.part_rounds and not len(known.positions) and images is None:
         targets = [Target(frame, scales, settings.normal_weight) for frame in frames]
         x, R = (np.stack([f[k] for f in fine], axis=1) for k in range(2))
         found, covariance = find_rigid_parts(
@@ -315,12 +315,12 @@ def _tracks(model: NodeModel, frames: list[NodeFit], reference: int, unit: Unit)
     return NodeTracks(unit.back(x), R, unit.length**2 * covariance, reference, places, model.graph.edges)
 
 
-def _measured(anchors: MotionPaths | None, positions: np.ndarray, unit: Unit) -> Anchors:
-    """Anchors with `positions` (P, T, 3) in `unit`; none of those whose precision isn't known."""
+def _measured(anchors: MotionPaths | None, known: Anchors, unit: Unit) -> Anchors:
+    """The same anchors with their precision; none if that isn't known."""
     if anchors is None or anchors.sigma is None:
-        return Anchors(positions[:0], np.zeros((0, positions.shape[1])))
+        return Anchors.none(known.positions.shape[1])
     sigma = anchors.sigma if anchors.sigma.ndim == 2 else anchors.sigma[:, None]
-    return Anchors(positions, np.broadcast_to(sigma / unit.length, positions.shape[:2]))
+    return replace(known, sigma=np.broadcast_to(sigma / unit.length, known.positions.shape[:2]))
 
 
 def _followed_in_images(

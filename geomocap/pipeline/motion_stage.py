@@ -6,32 +6,56 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomocap.errors import GeometryError
-from geomocap.evaluation.result_check import model_overlap
 from geomocap.files.corrected_cameras import camera_warnings
 from geomocap.files.results import write_diagnostics, write_ellipsoids, write_points, write_skeleton, write_warnings
 from geomocap.files.run import Run
 from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.ellipsoids import Ellipsoids, fit_ellipsoids
 from geomocap.model.frame_geometry import BodyPoints, Geometry
+from geomocap.model.motion_paths import MotionPaths
 from geomocap.motion import Motion, MotionSettings, find_motion
+from geomocap.pipeline.following_stage import write_followed
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.motion_fit import fit_unseen
+from geomocap.pipeline.motion_models import Explanation, explain_silhouettes, has_unseen, make_model
 from geomocap.pipeline.outline_reading import outlines_of
 from geomocap.pipeline.path_choice import motion_paths
-from geomocap.pipeline.subject_stage import make_model
 from geomocap.scheduling import map_items
-from geomocap.subject.model_building import BodyCloud, build_model
+from geomocap.skeleton.kinematics import posed
+from geomocap.subject.subject_model import MODEL_FILE, SubjectModel, write_model
 
 # Of the overlap of a model and the silhouettes. In nine hard captures bodies that were there raised it by 0.0045 to
 # 0.035 each, those that were not by 0.002 at most.
 _BODY_PRICE = 0.003
 
 
+@dataclass(frozen=True)
+class _Candidate:
+    """What was found from one kind of motion paths.
+
+    Attributes
+    ----------
+    motion : Motion
+    model : SubjectModel or str
+        In words why, if it can't be made.
+    explanation : Explanation, optional
+        Of the silhouettes; None where nothing depends on it.
+    """
+
+    motion: Motion
+    model: SubjectModel | str
+    explanation: Explanation | None
+
+    @property
+    def worth(self) -> float:
+        """Overlap with the silhouettes less the price of the bodies."""
+        return (self.explanation.overlap if self.explanation else 0.0) - _BODY_PRICE * self.motion.body_count
+
+
 def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     """Find bodies and skeleton from motion paths, write them, and return the number of frames.
 
-    `has_tracks` is what `motion_paths` takes.
+    Where there are several kinds of paths, what explains the silhouettes best is taken. `has_tracks` is what
+    `motion_paths` takes.
     """
     frames, config = len(geometry), job.config
     choice = motion_paths(job, geometry, has_tracks)
@@ -44,22 +68,34 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
             source: find_motion(paths, fps=job.fps, settings=settings, progress=job.progress, outlines=outlines)
             for source, paths in choice.items()
         }
-        source = _best(job, found_from, geometry)
-        motion = found_from[source]
         count["items"] = frames
+    candidates = {
+        source: _candidate(job, geometry, motion, choice[source], len(choice) > 1)
+        for source, motion in found_from.items()
+    }
+    source = max(candidates, key=lambda which: candidates[which].worth)
+    best = candidates[source]
+    motion, model = best.motion, best.model
     bodies, found = motion.bodies, motion.connected
     label = _Label(geometry, job.run, motion)
     ellipsoids = list(map_items(label, range(frames), job.executor, "labels", job.progress))
     job.run.note("segmentation", [job.run.frame_file("bodies", k) for k in range(frames)])
     write_ellipsoids(job.run, Ellipsoids.stack(ellipsoids, np.arange(bodies.body_count, dtype=np.int32)))
     write_skeleton(job.run, found.skeleton)
-    warnings = [*camera_warnings(job.run), *motion.warnings, *make_model(job, geometry, motion)]
+    warnings = [*camera_warnings(job.run), *motion.warnings]
     axes = np.array([joint.axis for joint in found.joints]).reshape(-1, 3)
-    fitted = fit_unseen(job, geometry, motion, choice[source])
-    if fitted is not None:
-        unseen = int((motion.bodies.reliability == 0).any(axis=1).sum())
-        warnings.append(f"In {unseen} of {frames} frames no path shows some body; the model was fitted to the surface.")
-        axes = fitted.axes
+    if isinstance(model, str):
+        warnings.append(model)
+    else:
+        write_model(job.run.path / MODEL_FILE, model)
+        if best.explanation is not None and best.explanation.fit is not None:
+            fit = best.explanation.fit
+            write_followed(job, geometry, model, fit)
+            axes = posed(model.linkage, fit, 0).axes
+            unseen = int((bodies.reliability == 0).any(axis=1).sum())
+            warnings.append(
+                f"In {unseen} of {frames} frames no path shows some body; the model was fitted to the surface."
+            )
     if warnings:
         write_warnings(job.run, warnings)
     made = Diagnostics(
@@ -81,30 +117,12 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     return frames
 
 
-def _best(job: Job, found: dict[str, Motion], geometry: Geometry) -> str:
-    """Which motion's model, drawn into the cameras, explains their silhouettes best.
-
-    Each further body has to raise that by `_BODY_PRICE`.
-    """
-    if len(found) < 2 or job.capture is None:
-        return next(iter(found))
-    capture = job.capture
-
-    def overlap(source: str) -> float:
-        motion = found[source]
-
-        def read(frame: int) -> BodyCloud:
-            points = geometry.points(frame)
-            return BodyCloud(points, motion.label(frame, points))
-
-        try:
-            model = build_model(motion.connected, motion.bodies, read, geometry.spacing, job.up_axis)
-        except GeometryError:
-            return 0.0
-        return model_overlap(job.run, capture, model, motion.skeleton)
-
-    explained = {source: overlap(source) for source in found}
-    return max(found, key=lambda source: explained[source] - _BODY_PRICE * found[source].body_count)
+def _candidate(job: Job, geometry: Geometry, motion: Motion, paths: MotionPaths, several: bool) -> _Candidate:
+    """Make the model of a motion, and see how well it explains the silhouettes where that decides something."""
+    model = make_model(job, geometry, motion)
+    if job.capture is None or isinstance(model, str) or not (several or has_unseen(motion)):
+        return _Candidate(motion, model, None)
+    return _Candidate(motion, model, explain_silhouettes(job, geometry, model, motion, paths))
 
 
 @dataclass(frozen=True)

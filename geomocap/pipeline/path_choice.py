@@ -34,7 +34,8 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
 
     They are "patches", "nodes", "both" (nodes held by patches and images), "pieces" (patches, and where these leave
     pieces of the surface uncovered, nodes held by them), "points" or "ellipsoids". Nodes are followed only where some
-    piece needs them; then "pieces" and "both" are returned.
+    piece needs them; then "pieces" and "both" are returned. Or where single cameras followed the surface, whose depths
+    are those of the volume as well; then "patches" and "both".
 
     Parameters
     ----------
@@ -65,10 +66,7 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
             )
         return {"patches": patches}
     reach = 0.0
-    if patches is not None:
-        if patches.ray is not None:
-            # single cameras follow the rest of the surface: what is still uncovered is bulk of a hull of few cameras
-            return {"patches": patches}
+    if patches is not None and patches.ray is None:
         reach = piece_reach(geometry.points(0))
         if uncovered_fraction(geometry.points, patches.positions, reach) < SMALLEST_PIECE:
             return {"patches": patches}
@@ -77,6 +75,8 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
     held = nodes.motion_paths() if nodes.geometric is None else replace(nodes.motion_paths(), sigma=None)
     if patches is None:
         return {"nodes" if tracked is None else "both": held}
+    if patches.ray is not None:  # what these leave uncovered is bulk of a hull of few cameras, and no piece
+        return {"patches": patches, "both": held}
     blind = (nodes.geometric or nodes).motion_paths()
     rest = left_over(blind.positions, patches.positions, reach)
     return {"pieces": _joined(patches, blind, rest), "both": held}

@@ -88,11 +88,13 @@ def test_nodes_on_the_piece_that_patches_leave_uncovered(job):
     assert np.nanmedian(paths.sigma[300:]) > 5 * np.nanmedian(paths.sigma[:300])
 
 
-def test_what_single_cameras_leave_uncovered_is_bulk_of_the_hull_and_gets_no_nodes(job):
+def test_where_single_cameras_follow_the_surface_there_are_nodes_to_choose_instead(job):
     tracks = trajectories(300, 1.0, 0.0)
     ray = np.zeros_like(tracks)
     ray[::2, :, 1] = 1.0
-    assert list(motion_paths(job("auto", tracks, ray), Ball(), True)) == ["patches"]
+    found = motion_paths(job("auto", tracks, ray), Ball(), True)
+    assert list(found) == ["patches", "both"]
+    assert found["patches"].ray is not None
 
 
 def test_nodes_where_patches_are_there_for_a_while_only(job):

@@ -1,0 +1,84 @@
+"""Models of motions that were found, and how well they explain the silhouettes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from geomocap.errors import GeometryError
+from geomocap.evaluation.result_check import model_overlap
+from geomocap.model.frame_geometry import Geometry
+from geomocap.model.motion_paths import MotionPaths
+from geomocap.motion import Motion
+from geomocap.nodes.surface_coverage import SMALLEST_PIECE
+from geomocap.pipeline.following_stage import model_skeleton
+from geomocap.pipeline.job import Job
+from geomocap.pipeline.window_following import surfaces_of
+from geomocap.skeleton.kinematics import BodyMotion, joint_motion
+from geomocap.subject.model_building import BodyCloud, build_model
+from geomocap.subject.model_following import fit_motion
+from geomocap.subject.subject_model import SubjectModel
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """How well a model explains the silhouettes.
+
+    Attributes
+    ----------
+    overlap : float
+        Of the model, drawn into the cameras, with the silhouettes: intersection over union, mean of the images.
+    fit : BodyMotion, optional
+        The motion that does so, if that is the model fitted to the surfaces and not the one that was found.
+    """
+
+    overlap: float
+    fit: BodyMotion | None = None
+
+
+def make_model(job: Job, geometry: Geometry, motion: Motion) -> SubjectModel | str:
+    """Make the model of a motion's subject; in words why, if it can't be made."""
+
+    def read(frame: int) -> BodyCloud:
+        points = geometry.points(frame)
+        colors = geometry.features(frame) if geometry.features is not None else None
+        return BodyCloud(points, motion.label(frame, points), colors)
+
+    try:
+        with job.run.timed("model") as count:
+            model = build_model(motion.connected, motion.bodies, read, geometry.spacing, job.up_axis)
+            count["items"] = len(model.points)
+    except GeometryError as error:
+        return str(error)
+    return model
+
+
+def has_unseen(motion: Motion) -> bool:
+    """Whether no path shows some body in some frame."""
+    return not (motion.bodies.reliability > 0).all()
+
+
+def explain_silhouettes(
+    job: Job, geometry: Geometry, model: SubjectModel, motion: Motion, paths: MotionPaths
+) -> Explanation:
+    """Draw a motion's model into the cameras; fit it to the surfaces of all frames if no path shows some body in some.
+
+    The fit is kept if the model then overlaps the silhouettes more, by at least what the smallest piece of a surface
+    is: a surface alone knows less than paths do where these are. `paths` are those that the motion was found from.
+    """
+    assert job.capture is not None
+    found = motion.skeleton
+    before = model_overlap(job.run, job.capture, model, found)
+    if not has_unseen(motion):
+        return Explanation(before)
+    start = joint_motion(model.linkage, found.body_rotations, found.root_positions)
+    try:
+        with job.run.timed("fit") as count:
+            followed = fit_motion(
+                model, start, surfaces_of(geometry, model), geometry.spacing, paths, job.config.following, job.progress
+            )
+            count["items"] = len(geometry)
+    except GeometryError:  # a frame shows next to nothing of the subject
+        return Explanation(before)
+    skeleton = model_skeleton(model, followed.bodies, job.fps)
+    after = model_overlap(job.run, job.capture, model.reposed(followed.bodies, 0), skeleton)
+    return Explanation(before) if after < before + SMALLEST_PIECE else Explanation(after, followed.bodies)
