@@ -106,12 +106,13 @@ def carried(graph: NodeGraph, sample: np.ndarray, x: np.ndarray, R: np.ndarray) 
     return y, (w[..., None, None] * R[nodes]).sum(axis=1)
 
 
-def find_homes(graph: NodeGraph, x: np.ndarray, R: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Where points at `positions` (P, 3) of a frame were in the reference frame (P, 3), metres.
+def find_homes(graph: NodeGraph, x: np.ndarray, R: np.ndarray, anchors: Anchors, frame: int) -> np.ndarray:
+    """Where the anchors of a frame were in the reference frame, (P, 3), metres; NaN where not known.
 
-    Each is carried back by the sample next to it; NaN stays NaN, as does what is farther from the surface than half the
-    nodes' spacing.
+    Each is carried back by the sample next to it; what is farther from the surface than half the nodes' spacing has no
+    home. That of an anchor with a ray is beside its sample: how far before or behind it, nobody saw.
     """
+    positions = anchors.positions[:, frame]
     homes = np.full(positions.shape, np.nan)
     rows = np.flatnonzero(np.isfinite(positions[:, 0]))
     if not len(rows):
@@ -119,5 +120,9 @@ def find_homes(graph: NodeGraph, x: np.ndarray, R: np.ndarray, positions: np.nda
     distance, sample = cKDTree(graph.deform(x, R)[0]).query(positions[rows])
     rows, sample = rows[distance < 0.5 * graph.spacing], sample[distance < 0.5 * graph.spacing].astype(int)
     y, turn = carried(graph, sample, x, R)
-    homes[rows] = graph.samples[sample] + np.einsum("kji,kj->ki", turn, positions[rows] - y)
+    away = positions[rows] - y
+    if anchors.ray is not None:
+        ray = anchors.ray[rows, frame]
+        away -= (away * ray).sum(axis=1, keepdims=True) * ray
+    homes[rows] = graph.samples[sample] + np.einsum("kji,kj->ki", turn, away)
     return homes

@@ -212,13 +212,13 @@ def follow(
     """
     states = [model.start()]
     anchors = anchors or Anchors.none(len(frames))
-    homes = anchors.positions[:, reference].copy()
+    homes = find_homes(model.graph, states[0].x, states[0].R, anchors, reference)
     end = len(frames) if way > 0 else -1
     for k in range(reference + way, end, way):
         frame = model.marked(frames[k], homes, anchors, k)
         states.append(model.next_state(frame, states[-1], states[-2] if len(states) > 1 else None))
         new = np.isnan(homes[:, 0])
-        homes[new] = find_homes(model.graph, states[-1].x, states[-1].R, anchors.positions[new, k])
+        homes[new] = find_homes(model.graph, states[-1].x, states[-1].R, anchors, k)[new]
     return states, homes
 
 

@@ -102,7 +102,7 @@ class ImageMotion:
         g = self.graph
         states: list[NodeState] = [(g.nodes, np.tile(np.eye(3), (len(g.nodes), 1, 1)))]
         seen = [self._seen(read(reference), states[0])]
-        homes = known.positions[:, reference].copy()
+        homes = find_homes(g, *states[0], known, reference)
         for t in range(reference + way, len(frames) if way > 0 else -1, way):
             images = read(t)
             earlier = [seen[-k] for k in EARLIER if k <= len(seen)]
@@ -114,7 +114,7 @@ class ImageMotion:
             best = found[0][0] if len(found) < 2 else self._better(frames[t], found)
             states.append(self._fit(frames[t], images, earlier, marks, best, 1)[0])
             new = np.isnan(homes[:, 0])
-            homes[new] = find_homes(g, *states[-1], known.positions[new, t])
+            homes[new] = find_homes(g, *states[-1], known, t)[new]
             seen = [*seen[-max(EARLIER) + 1 :], self._seen(images, states[-1])]
         return states
 

@@ -11,8 +11,6 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
-from geomocap.model.motion_paths import MotionPaths
-from geomocap.nodes.anchors import find_homes
 from geomocap.nodes.correspondences import Target, gather_pulls, pull
 from geomocap.nodes.deformation import block_pattern, normal_equations, solve_blocks, step
 from geomocap.nodes.extremities import extremities, match_ends
@@ -339,39 +337,3 @@ def test_each_face_of_a_box_is_turned_by_itself():
     known = p[:300] + 0.02
     turned = s.turned_like(known, outward[:300], 0.08).normals
     assert ((turned * outward).sum(axis=1) > 0).mean() > 0.98
-
-
-def test_anchors_show_the_twist_of_a_round_limb():
-    # a round rod that turns about its axis looks the same all the time
-    angles = np.deg2rad(12.0) * np.arange(5)
-    turns = Rotation.from_rotvec(np.column_stack([angles, 0 * angles, 0 * angles])).as_matrix()
-    skin = SMALL.model_copy(update={"part_rounds": 0})
-
-    def rod(seed: int) -> np.ndarray:
-        return capsule(1200, seed=seed) / [1, 1, 0.7]
-
-    def error(anchors: np.ndarray | None) -> tuple[float, float]:
-        known = None if anchors is None else MotionPaths(anchors)
-        t = track_nodes(lambda k: rod(20 + k) @ turns[k].T, 5, skin, anchors=known)
-        at_rest = t.reference @ turns[t.reference_frame]
-        truth = np.einsum("tij,nj->nti", turns, at_rest)
-        return float(np.median(np.linalg.norm(t.positions - truth, axis=-1)[:, [0, 4]])), float(np.median(t.sigma))
-
-    marks = np.einsum("tij,nj->nti", turns, rod(50)[:60])
-    marks[::2, 0] = np.nan  # half of them are met later
-    marks[1::2, 4] = np.nan
-    (without, unsure), (with_them, sure) = error(None), error(marks)
-    # 24° on a radius of 8 cm are 33 mm
-    assert without > 0.02
-    assert with_them < 0.012
-    assert sure < 0.8 * unsure
-
-
-def test_homes_are_where_points_came_from():
-    _, _, g = small_graph()
-    R = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
-    x, turns = g.nodes @ R.T + [0.3, 2.0, -1.0], np.tile(R, (len(g.nodes), 1, 1))
-    points = np.vstack([g.samples[:20] @ R.T + [0.3, 2.0, -1.0], [[np.nan] * 3], [[9.0, 9, 9]]])
-    homes = find_homes(g, x, turns, points)
-    np.testing.assert_allclose(homes[:20], g.samples[:20], atol=1e-9)
-    assert np.isnan(homes[20:]).all()

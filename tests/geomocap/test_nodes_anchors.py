@@ -1,0 +1,79 @@
+"""Anchors: paths known from elsewhere that keep nodes from sliding."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from geomocap.model.motion_paths import MotionPaths
+from geomocap.nodes.anchors import AnchorPoints, Anchors, find_homes
+from geomocap.nodes.node_tracking import track_nodes
+from tests.geomocap.test_nodes_tracking import SMALL, capsule, small_graph
+
+# A round rod that turns about its axis looks the same all the time
+ANGLES = np.deg2rad(12.0) * np.arange(5)
+TURNS = Rotation.from_rotvec(np.column_stack([ANGLES, 0 * ANGLES, 0 * ANGLES])).as_matrix()
+
+
+def rod(seed: int) -> np.ndarray:
+    return capsule(1200, seed=seed) / [1, 1, 0.7]
+
+
+def error(anchors: MotionPaths | None) -> tuple[float, float]:
+    """Median error of the nodes of the rod in its outer frames, and their standard deviation, metres."""
+    skin = SMALL.model_copy(update={"part_rounds": 0})
+    t = track_nodes(lambda k: rod(20 + k) @ TURNS[k].T, 5, skin, anchors=anchors)
+    at_rest = t.reference @ TURNS[t.reference_frame]
+    truth = np.einsum("tij,nj->nti", TURNS, at_rest)
+    return float(np.median(np.linalg.norm(t.positions - truth, axis=-1)[:, [0, 4]])), float(np.median(t.sigma))
+
+
+def test_anchors_show_the_twist_of_a_round_limb():
+    marks = np.einsum("tij,nj->nti", TURNS, rod(50)[:60])
+    marks[::2, 0] = np.nan  # half of them are met later
+    marks[1::2, 4] = np.nan
+    (without, unsure), (with_them, sure) = error(None), error(MotionPaths(marks))
+    # 24° on a radius of 8 cm are 33 mm
+    assert without > 0.02
+    assert with_them < 0.012
+    assert sure < 0.8 * unsure
+
+
+def test_wrong_depths_of_anchors_do_little_harm_where_rays_say_so():
+    home = rod(50)
+    marks = np.einsum("tij,nj->nti", TURNS, home[home[:, 1] > 0.03][:80])
+    ray = np.zeros_like(marks)
+    ray[..., 1] = -1.0
+    off = 0.04 * np.random.default_rng(2).normal(size=(1, 5, 1)) * ray  # as hulls of few cameras are off
+    misled, told = error(MotionPaths(marks + off))[0], error(MotionPaths(marks + off, ray=ray))[0]
+    assert misled > 0.01
+    assert told < 0.005
+
+
+def test_anchors_pull_across_their_rays_and_hardly_along_them():
+    _, _, graph = small_graph()
+    still = (graph.nodes, np.tile(np.eye(3), (len(graph.nodes), 1, 1)))
+    home = graph.samples[:1]
+
+    def pulled(offset: np.ndarray, ray: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        A, b = np.zeros((len(graph.samples), 3, 3)), np.zeros((len(graph.samples), 3))
+        known = Anchors((home + offset)[:, None], ray=None if ray is None else ray[None, None])
+        AnchorPoints.of(graph, home, known, 0).add_to(A, b, graph, *still, 1.0, 100.0)
+        return A.sum(axis=0), b.sum(axis=0)
+
+    along = np.array([0.0, 0.6, 0.8])
+    across = np.array([1.0, 0.0, 0.0])
+    np.testing.assert_allclose(pulled(0.01 * across, along)[1], pulled(0.01 * across, None)[1], rtol=1e-6)
+    matrix, pull = pulled(0.01 * along, along)
+    np.testing.assert_allclose(pull, 0.01 * pulled(0.01 * along, None)[1], atol=1e-9)
+    np.testing.assert_allclose(along @ matrix @ along, 0.01, rtol=1e-4)
+
+
+def test_homes_are_where_points_came_from():
+    _, _, g = small_graph()
+    R = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
+    x, turns = g.nodes @ R.T + [0.3, 2.0, -1.0], np.tile(R, (len(g.nodes), 1, 1))
+    points = np.vstack([g.samples[:20] @ R.T + [0.3, 2.0, -1.0], [[np.nan] * 3], [[9.0, 9, 9]]])
+    homes = find_homes(g, x, turns, Anchors(points[:, None]), 0)
+    np.testing.assert_allclose(homes[:20], g.samples[:20], atol=1e-9)
+    assert np.isnan(homes[20:]).all()
