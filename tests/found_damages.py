@@ -13,6 +13,15 @@ FOUND: list[tuple[str, list[tuple[str, float, object]]]] = [
     # times next to each other, and places beyond all measure: their quotients and squares overflow
     ("trc", [("put", 0.8647493576945331, b"1e-320")]),
     ("trc", [("byte", 0.3114668067754849, 69)]),
+    # colours of 1e38: 255 times them overflow
+    ("bodies.ply", [("drop", 0.1326346161446602, 16)]),
+    # numbers that are infinite, and names that no file can have
+    ("stage record", [("put", 0.9037598449471447, b"1e400")]),
+    ("stage record", [("put", 0.8025455432872881, b"\\u0000")]),
+    ("stage journal", [("over", 0.2227622221534421, b"1e400")]),
+    ("stage journal", [("put", 0.559377446913149, b"\\u0000")]),
+    # a component of no numbers, which Open3D reads all the same
+    ("scan of text.pcd", [("byte", 0.05775862068965517, 48)]),
     # points without x, y, z
     ("bodies.ply", [("drop", 0.09694369466585184, 52)]),
     # a scan of no components

@@ -78,9 +78,7 @@ def read_points(path: Path) -> BodyPoints:
     if "colors" in cloud.point:
         colors = cloud.point.colors.numpy()
         colors = (
-            colors
-            if colors.dtype == np.uint8
-            else np.clip(np.rint(np.nan_to_num(colors) * 255), 0, 255).astype(np.uint8)
+            colors if colors.dtype == np.uint8 else np.rint(np.clip(np.nan_to_num(colors), 0, 1) * 255).astype(np.uint8)
         )
     if "normals" in cloud.point:
         normals = quiet_nan(cloud.point.normals.numpy()).astype(np.float64)

@@ -23,6 +23,7 @@ _LZF = 150  # times; more than LZF can pack
 _COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _MOST = 1 << 26  # elements of an accessor without data
+_PCD_ENTRIES = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 _DEEPEST = 200  # nodes of a scene below each other
 
 
@@ -70,33 +71,47 @@ def _count(word: bytes | str) -> int:
     return number
 
 
-def _pcd(path: Path, data: bytes) -> int:
-    at, said = 0, dict[str, list[str]]()
+def _pcd_header(data: bytes) -> tuple[dict[str, list[str]], int]:
+    """Entries of a PCD's header, and where its data begin; its entries have to be in the order of its specification."""
+    at, said, left = 0, dict[str, list[str]](), list(_PCD_ENTRIES)
     while "DATA" not in said:
         end = data.index(b"\n", at)
-        words = data[at:end].decode("ascii", "replace").split()
-        if words and not words[0].startswith("#"):
-            said[words[0].upper()] = words[1:]
+        line = data[at:end].decode("utf-8", "replace").removesuffix("\r").replace("\t", " ")
         at = end + 1
+        if not line.strip() or line.startswith("#"):
+            continue
+        name, *words = line.split()
+        if name not in left or not (line.isascii() and line.isprintable()):
+            raise ValueError("its entries aren't VERSION, FIELDS, SIZE, TYPE, COUNT, WIDTH … in this order")
+        said[name], left = words, left[left.index(name) + 1 :]
+    return said, at
+
+
+def _pcd(path: Path, data: bytes) -> int:
+    said, at = _pcd_header(data)
     sizes = [_count(s) for s in said["SIZE"]]
     counts = [_count(c) for c in said.get("COUNT", ["1"] * len(sizes))]
     points = _count(said["POINTS"][0]) if "POINTS" in said else _count(said["WIDTH"][0]) * _count(said["HEIGHT"][0])
     if points > _count(said["WIDTH"][0]) * _count(said.get("HEIGHT", ["1"])[0]):
         raise ValueError("its WIDTH, HEIGHT and POINTS contradict each other")
-    if not sizes or not all(0 < s <= 8 for s in sizes) or len(sizes) != len(counts) != len(said["FIELDS"]):
+    if not len(said["FIELDS"]) == len(sizes) == len(counts) > 0 or not all(counts):
         raise ValueError("its FIELDS, SIZE and COUNT contradict each other")
+    if not all(0 < s <= 8 for s in sizes):
+        raise ValueError("its SIZE has more than 8 bytes, or none")
     stride = sum(s * c for s, c in zip(sizes, counts, strict=True))
     rest = len(data) - at
-    match said["DATA"][0].lower():
+    match said["DATA"][0]:
         case "ascii":
             return points * 2 * sum(counts) - 1 - rest
         case "binary":
             return points * stride - rest
-        case _:
+        case "binary_compressed":
             packed, unpacked = struct.unpack_from("<II", data, at)
             if unpacked != points * stride or unpacked > _LZF * packed:
                 raise ValueError("the length of its compressed data contradicts its points")
             return packed + 8 - rest
+        case other:
+            raise ValueError(f"data of an unknown kind, {other!r}")
 
 
 def _pts(path: Path, data: bytes) -> int:

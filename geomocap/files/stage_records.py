@@ -40,7 +40,7 @@ class FileMark:
         """Say what is wrong with the file that was marked; nothing if it is as it was."""
         try:
             stat = path.stat()
-        except OSError:
+        except (OSError, ValueError):  # the latter where no file can have such a name
             return "missing"
         if not path.is_file():
             return "no file any more"
@@ -109,14 +109,14 @@ def read_record(run: Path, stage: str) -> StageRecord:
         said = json.loads(read_bytes(run / FOLDER / f"{stage}.json"))
         files = {str(name): FileMark(*map(int, mark)) for name, mark in said.get("files", {}).items()}
         record = StageRecord(str(said["key"]), bool(said["done"]), tuple(map(str, said["outputs"])), files)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         return StageRecord()
     added = dict(files)
     for line in _lines(run / FOLDER / f"{stage}.journal"):
         try:
             name, *mark = json.loads(line)
             added[str(name)] = FileMark(*map(int, mark))
-        except (ValueError, TypeError):  # a line that was not finished
+        except (ValueError, TypeError, OverflowError):  # a line that was not finished
             continue
     return replace(record, files={name: mark for name, mark in added.items() if _stays_inside(name)})
 
