@@ -8,7 +8,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geomocap.model.motion_paths import DEPTH_FRACTION, sure_part
+from geomocap.model.rotations import nearest_rotation
 from geomocap.nodes.node_graph import NodeGraph
+
+_AROUND = 12  # marks that move a node
+_LEAST = 4
+_REACH = 2.0  # node spacings
+_TURN = 1e-3  # squared node spacings; a turn that marks hardly show stays as it is
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,39 @@ class AnchorPoints:
         sigma, ray = (None if a is None else a[known, frame][near] for a in (anchors.sigma, anchors.ray))
         precision = np.ones(len(sample)) if sigma is None else 1 / sigma**2
         return cls(sample, graph.samples[sample] - home[near], positions[known][near], precision, ray)
+
+    def move(self, graph: NodeGraph, x: np.ndarray, R: np.ndarray, give: float) -> tuple[np.ndarray, np.ndarray]:
+        """Put nodes where the marks around them are: each moves from the reference as the nearest marks do, rigidly.
+
+        Other nodes stay: those around which fewer than four marks are known, or whose marks don't move as one. Marks
+        that are unsure along a ray have no say.
+
+        Parameters
+        ----------
+        x, R : (N, 3), (N, 3, 3) float
+            State of the nodes.
+        give : float
+            What marks miss of one motion, at most (node spacings).
+        """
+        sure = np.ones(len(self.sample), bool) if self.ray is None else ~self.ray.any(axis=1)
+        if sure.sum() < _AROUND:
+            return x, R
+        home, place = (graph.samples[self.sample] - self.offset)[sure], self.position[sure]
+        distance, near = cKDTree(home).query(graph.nodes, _AROUND)
+        weight = np.where(distance < _REACH * graph.spacing, np.exp(-0.5 * (distance / graph.spacing) ** 2), 0.0)
+        enough = (weight > 0).sum(axis=1) >= _LEAST
+        weight, near = weight[enough] / weight[enough].sum(axis=1, keepdims=True), near[enough]
+        rest, now = ((weight[..., None] * places[near]).sum(axis=1) for places in (home, place))
+        away, moved = home[near] - rest[:, None], place[near] - now[:, None]
+        moments = np.einsum("nk,nki,nkj->nij", weight, moved, away)
+        turn = nearest_rotation(moments + _TURN * graph.spacing**2 * R[enough])
+        miss = moved - np.einsum("nij,nkj->nki", turn, away)
+        one = np.sqrt((weight * (miss**2).sum(axis=2)).sum(axis=1)) < give * graph.spacing
+        rows = np.flatnonzero(enough)[one]
+        x, R = x.copy(), R.copy()
+        x[rows] = now[one] + np.einsum("nij,nj->ni", turn[one], graph.nodes[rows] - rest[one])
+        R[rows] = turn[one]
+        return x, R
 
     def add_to(
         self, A: np.ndarray, b: np.ndarray, graph: NodeGraph, x: np.ndarray, R: np.ndarray, weight: float, scale: float
