@@ -61,8 +61,6 @@ class NodeTracks:
         Neighbours on the surface.
     parts : (N,) int, optional
         Rigid part of each node, if they were followed as parts.
-    geometric : NodeTracks, optional
-        The same nodes followed in the geometry alone, if images were given.
     """
 
     positions: np.ndarray
@@ -72,7 +70,6 @@ class NodeTracks:
     reference: np.ndarray
     edges: np.ndarray
     parts: np.ndarray | None = None
-    geometric: NodeTracks | None = None
 
     @property
     def sigma(self) -> np.ndarray:
@@ -285,9 +282,7 @@ def track_nodes(
         return model.refine(target, states[frame], homes[frame], known, frame)
 
     fine = list(map_items(refine, list(range(n_frames)), executor, "nodes", progress))
-    blind = None
     if images is not None:
-        blind = _tracks(model, fine, reference, unit)
         geometric = [(f[0], f[1]) for f in fine]
         measured = _measured(anchors, known, unit)
         fine = _followed_in_images(model, frames, geometric, reference, measured, images, unit, executor, progress)
@@ -304,7 +299,7 @@ def track_nodes(
         return replace(
             tracks, positions=positions, rotations=R, covariance=unit.length**2 * covariance, parts=found.label
         )
-    return replace(tracks, geometric=blind)
+    return tracks
 
 
 def _tracks(model: NodeModel, frames: list[NodeFit], reference: int, unit: Unit) -> NodeTracks:

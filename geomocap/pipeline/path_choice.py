@@ -14,7 +14,7 @@ from geomocap.files.scans import Scans
 from geomocap.model.frame_geometry import Geometry
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.trajectories import Trajectories
-from geomocap.nodes.node_tracking import NodeTracks, track_nodes
+from geomocap.nodes.node_tracking import track_nodes
 from geomocap.nodes.surface_coverage import SMALLEST_PIECE, left_over, piece_reach, uncovered_fraction
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.track_stage import frame_reader
@@ -33,7 +33,7 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
     """Motion paths by what they are; where there is a choice, bodies tell which are best.
 
     They are "patches", "nodes", "both" (nodes held by patches and images), "pieces" (patches, and where these leave
-    pieces of the surface uncovered, nodes held by them), "points" or "ellipsoids". Nodes are followed only where some
+    pieces of the surface uncovered, those nodes there), "points" or "ellipsoids". Nodes are followed only where some
     piece needs them; then "pieces" and "both" are returned. Or where single cameras followed the surface, whose depths
     are those of the volume as well; then "patches" and "both".
 
@@ -70,20 +70,20 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
         reach = piece_reach(geometry.points(0))
         if uncovered_fraction(geometry.points, patches.positions, reach) < SMALLEST_PIECE:
             return {"patches": patches}
-    nodes = _follow_nodes(job, geometry, None if tracked is None else _anchors(tracked))
+    anchors = None if tracked is None else _anchors(tracked)
+    nodes = _follow_nodes(job, geometry, anchors)
     # nodes that images hold are as precise as their neighbourhood shows; the geometry doesn't know it
-    held = nodes.motion_paths() if nodes.geometric is None else replace(nodes.motion_paths(), sigma=None)
+    held = nodes if anchors is None else replace(nodes, sigma=None)
     if patches is None:
         return {"nodes" if tracked is None else "both": held}
     if patches.ray is not None:  # what these leave uncovered is bulk of a hull of few cameras, and no piece
         return {"patches": patches, "both": held}
-    blind = (nodes.geometric or nodes).motion_paths()
-    rest = left_over(blind.positions, patches.positions, reach)
-    return {"pieces": _joined(patches, blind, rest), "both": held}
+    rest = left_over(nodes.positions, patches.positions, reach)
+    return {"pieces": _joined(patches, nodes, rest), "both": held}
 
 
-def _follow_nodes(job: Job, geometry: Geometry, anchors: MotionPaths | None) -> NodeTracks:
-    """Follow nodes of the geometry, which `anchors` keep from sliding."""
+def _follow_nodes(job: Job, geometry: Geometry, anchors: MotionPaths | None) -> MotionPaths:
+    """Follow nodes of the geometry, which `anchors` and the images keep from sliding."""
     features = geometry.features if job.config.nodes.colors else None
     following = job.config.nodes
     if job.capture is not None:  # the hull changes its shape with the pose: what is rigid doesn't look so
@@ -91,7 +91,10 @@ def _follow_nodes(job: Job, geometry: Geometry, anchors: MotionPaths | None) -> 
     images = None
     if job.capture is not None and anchors is not None:
         images = frame_reader(as_seen(job.run, job.capture), job.run, job.config.tracking)
-    return track_nodes(geometry.points, len(geometry), following, features, job.progress, job.executor, anchors, images)
+    nodes = track_nodes(
+        geometry.points, len(geometry), following, features, job.progress, job.executor, anchors, images
+    )
+    return nodes.motion_paths()
 
 
 def point_paths(job: Job, geometry: Geometry) -> MotionPaths | None:
