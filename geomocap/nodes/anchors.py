@@ -78,11 +78,14 @@ class AnchorPoints:
         precision = np.ones(len(sample)) if sigma is None else 1 / sigma**2
         return cls(sample, graph.samples[sample] - home[near], positions[known][near], precision, ray)
 
-    def move(self, graph: NodeGraph, x: np.ndarray, R: np.ndarray, give: float) -> tuple[np.ndarray, np.ndarray]:
-        """Put nodes where the marks around them are: each moves from the reference as the nearest marks do, rigidly.
+    def move(
+        self, graph: NodeGraph, x: np.ndarray, R: np.ndarray, give: float, scale: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Put nodes that are far from the marks around them where these say, each by its marks' rigid motion.
 
-        Other nodes stay: those around which fewer than four marks are known, or whose marks don't move as one. Marks
-        that are unsure along a ray have no say.
+        A fit can't do that: a mark that is missed by much loses its weight. Other nodes stay, also those around which
+        fewer than four marks are known, or whose marks don't move as one. Marks that are unsure along a ray have no
+        say.
 
         Parameters
         ----------
@@ -90,6 +93,8 @@ class AnchorPoints:
             State of the nodes.
         give : float
             What marks miss of one motion, at most (node spacings).
+        scale : float
+            Distance at which a mark loses its weight, metres.
         """
         sure = np.ones(len(self.sample), bool) if self.ray is None else ~self.ray.any(axis=1)
         if sure.sum() < _AROUND:
@@ -105,6 +110,8 @@ class AnchorPoints:
         turn = nearest_rotation(moments + _TURN * graph.spacing**2 * R[enough])
         miss = moved - np.einsum("nij,nkj->nki", turn, away)
         one = np.sqrt((weight * (miss**2).sum(axis=2)).sum(axis=1)) < give * graph.spacing
+        expected = x[enough] + np.einsum("nij,nj->ni", R[enough], rest - graph.nodes[enough])
+        one &= np.linalg.norm(now - expected, axis=1) > scale
         rows = np.flatnonzero(enough)[one]
         x, R = x.copy(), R.copy()
         x[rows] = now[one] + np.einsum("nij,nj->ni", turn[one], graph.nodes[rows] - rest[one])

@@ -110,7 +110,7 @@ class ImageMotion:
             if len(states) > 1:
                 starts.insert(0, _continued(states[-2], states[-1]))
             marks = AnchorPoints.of(g, homes, known, t)
-            starts = [marks.move(g, *start, self.give) for start in starts]
+            starts = [marks.move(g, *start, self.give, self._scale()) for start in starts]
             found = [self._fit(frames[t], images, earlier, marks, start, 0) for start in starts]
             best = found[0][0] if len(found) < 2 else self._better(frames[t], found)
             states.append(self._fit(frames[t], images, earlier, marks, best, 1)[0])

@@ -86,14 +86,15 @@ def test_nodes_move_as_the_marks_around_them_and_others_stay():
     home = g.samples[g.samples[:, axis] < np.quantile(g.samples[:, axis], 0.25)]
     marks = AnchorPoints.of(g, home, Anchors((home @ R.T + shift)[:, None]), 0)
     still = g.nodes, np.tile(np.eye(3), (len(g.nodes), 1, 1))
-    x, turns = marks.move(g, *still, 0.3)
+    x, turns = marks.move(g, *still, 0.3, g.spacing)
     moved = (x != g.nodes).any(axis=1)
     amid = g.nodes[:, axis] < np.quantile(g.nodes[:, axis], 0.15)
     assert moved[amid].all() and not moved.all()
     np.testing.assert_allclose(x[amid], g.nodes[amid] @ R.T + shift, atol=0.02 * g.spacing)
     np.testing.assert_allclose(turns[amid], np.tile(R, (amid.sum(), 1, 1)), atol=0.05)
+    np.testing.assert_array_equal(marks.move(g, x, turns, 0.3, 0.5 * g.spacing)[0], x)  # they are there already
     # marks that contradict each other move nothing, nor do those that only one camera saw
     torn = AnchorPoints.of(g, home, Anchors((home + np.where(np.arange(len(home)) % 2, 1, -1)[:, None])[:, None]), 0)
     alone = AnchorPoints.of(g, home, Anchors((home + shift)[:, None], ray=np.ones((len(home), 1, 3))), 0)
     for none in (torn, alone):
-        np.testing.assert_array_equal(none.move(g, *still, 0.3)[0], g.nodes)
+        np.testing.assert_array_equal(none.move(g, *still, 0.3, 0.0)[0], g.nodes)
