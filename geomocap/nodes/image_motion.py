@@ -28,6 +28,7 @@ _SPREAD = (3.0, 1.0)  # pixels between those of a window, on coarse and on fine 
 _NORMAL = 1.4826  # standard deviation of a normal distribution, from its median distance
 _DEPARTED = 3.0  # squared differences of so many times the median lose three quarters of their weight
 _LEAST = 1e-6  # squared grey levels; images that are even differ by less
+_APART = 2.0  # node spacings between two places of a node, of which one is wrong
 _TORN = 1e-3  # of its stiffness a torn edge keeps: a node that nothing else holds stays beside its neighbours
 _CORRELATED = 0.3  # of the points' pull is counted: a hull's errors are alike over a piece of it
 
@@ -80,8 +81,9 @@ class ImageMotion:
     ) -> list[NodeState]:
         """Follow the graph from the reference frame on, forwards (way 1) or backwards (way −1).
 
-        Each frame is tried from where the motion so far leads, and from where the geometry alone has it; what explains
-        points and images better is kept.
+        Each frame is tried from where the motion so far leads, from there moved as the geometry alone moves, and with
+        limbs that the geometry has elsewhere put there; what explains points and images better is kept. A limb that is
+        elsewhere then than its motion led to had been lost, and is followed back into the frames before.
 
         Parameters
         ----------
@@ -103,24 +105,70 @@ class ImageMotion:
         states: list[NodeState] = [(g.nodes, np.tile(np.eye(3), (len(g.nodes), 1, 1)))]
         seen = [self._seen(read(reference), states[0])]
         homes = find_homes(g, *states[0], known, reference)
+
+        def marks_of(frame: int) -> AnchorPoints:
+            return AnchorPoints.of(g, homes, known, frame)
+
         for t in range(reference + way, len(frames) if way > 0 else -1, way):
             images = read(t)
             earlier = [seen[-k] for k in EARLIER if k <= len(seen)]
             starts = [_carried(geometric[t - way], geometric[t], states[-1], g.spacing)]
             if len(states) > 1:
                 starts.insert(0, _continued(states[-2], states[-1]))
-            marks = AnchorPoints.of(g, homes, known, t)
+            starts.append(_with_limbs(starts[0], geometric[t], self._apart(starts[0], geometric[t])))
+            marks = marks_of(t)
             starts = [marks.move(g, *start, self.give, self._scale()) for start in starts]
             found = [self._fit(frames[t], images, earlier, marks, start, 0) for start in starts]
-            best = found[0][0] if len(found) < 2 else self._better(frames[t], found)
+            best = found[self._better(frames[t], found)][0]
             states.append(self._fit(frames[t], images, earlier, marks, best, 1)[0])
             new = np.isnan(homes[:, 0])
             homes[new] = find_homes(g, *states[-1], known, t)[new]
+            if self._apart(states[-1], starts[0]).any():
+                self._follow_back(frames[reference::way], lambda k: marks_of(reference + way * k), states, seen)
             seen = [*seen[-max(EARLIER) + 1 :], self._seen(images, states[-1])]
         return states
 
-    def _better(self, frame: Target, found: list[tuple[NodeState, np.ndarray]]) -> NodeState:
-        """Return the state that leaves least of the points and of the images unexplained and is strained least.
+    def _follow_back(
+        self,
+        frames: list[Target],
+        marks: Callable[[int], AnchorPoints],
+        states: list[NodeState],
+        seen: list[_Earlier],
+    ) -> None:
+        """Put limbs that the last state has found again right in the states before it, in place, while that is better.
+
+        Parameters
+        ----------
+        frames, marks
+            Of each state.
+        states : list of NodeState
+        seen : list of _Earlier
+            Of the states before the last one, as many as are known.
+        """
+        for back in range(1, min(len(seen), len(states) - 1)):
+            k = len(states) - 1 - back
+            images, earlier = seen[-back].images, [seen[-back - e] for e in EARLIER if back + e <= len(seen)]
+            after = states[k + 1] if back < 2 else _continued(states[k + 2], states[k + 1])
+            start = _with_limbs(states[k], after, self._apart(states[k], states[k + 1]))
+            levels = ((states[k], (1,)), (start, (0, 1)))
+            found = []
+            for state, of in levels:
+                for level in of:
+                    state, errors = self._fit(frames[k], images, earlier, marks(k), state, level)
+                found.append((state, errors))
+            if self._better(frames[k], found) == 0:
+                return
+            changed = self._apart(states[k], found[1][0])
+            states[k], seen[-back] = found[1][0], self._seen(images, found[1][0])
+            if not changed.any():
+                return
+
+    def _apart(self, one: NodeState, other: NodeState) -> np.ndarray:
+        """Nodes that are clearly elsewhere in two states, (N,) bool."""
+        return np.linalg.norm(one[0] - other[0], axis=1) > _APART * self.graph.spacing
+
+    def _better(self, frame: Target, found: list[tuple[NodeState, np.ndarray]]) -> int:
+        """Return which state leaves least of the points and of the images unexplained and is strained least.
 
         Images are compared where both states have them.
         """
@@ -134,7 +182,7 @@ class ImageMotion:
             strain = float(np.minimum((self.graph.strain(x, R) / self.give) ** 2, 1.0).mean())
             unlike = float((errors[both] / (errors[both] + usual)).mean()) if both.any() else 0.0
             costs.append(points.energy + self.strain_cost * strain + unlike)
-        return found[int(np.argmin(costs))][0]
+        return int(np.argmin(costs))
 
     def _scale(self) -> float:
         return max(_SCALE * self.graph.spacing, 1.5 * self.point_spacing)
@@ -241,6 +289,11 @@ def _continued(before: NodeState, last: NodeState) -> NodeState:
     """Go on with the motion of the last frame."""
     (x0, R0), (x, R) = before, last
     return 2 * x - x0, R @ R0.transpose(0, 2, 1) @ R
+
+
+def _with_limbs(state: NodeState, other: NodeState, nodes: np.ndarray) -> NodeState:
+    """A state with some nodes, (N,) bool, as another has them."""
+    return np.where(nodes[:, None], other[0], state[0]), np.where(nodes[:, None, None], other[1], state[1])
 
 
 def _carried(before: NodeState, after: NodeState, state: NodeState, spacing: float) -> NodeState:
