@@ -2,7 +2,7 @@
 
 From the reference frame on, both ways, each frame's nodes answer to the frame's points, to their own stiffness and to
 the images of earlier frames, in one system of equations. Earlier frames are several, near and far in time: near ones
-look alike, far ones keep errors from adding up.
+look alike, far ones and the reference keep errors from adding up.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from geomocap.nodes.image_pull import HALF, LEAST_COSINE, FrameImages, window_pu
 from geomocap.nodes.node_graph import NodeGraph
 
 EARLIER = (1, 4, 16)
-"""Frames before the present one that its images are compared with."""
+"""Frames before the present one that its images are compared with, besides the reference frame."""
 _SCALE = 0.6  # distance at which a point loses its weight, node spacings
 _STEPS = (3, 3)  # on coarse and on fine images
 _SPREAD = (3.0, 1.0)  # pixels between those of a window, on coarse and on fine images
@@ -104,6 +104,7 @@ class ImageMotion:
         g = self.graph
         states: list[NodeState] = [(g.nodes, np.tile(np.eye(3), (len(g.nodes), 1, 1)))]
         seen = [self._seen(read(reference), states[0])]
+        first = seen[0]
         homes = find_homes(g, *states[0], known, reference)
 
         def marks_of(frame: int) -> AnchorPoints:
@@ -112,6 +113,7 @@ class ImageMotion:
         for t in range(reference + way, len(frames) if way > 0 else -1, way):
             images = read(t)
             earlier = [seen[-k] for k in EARLIER if k <= len(seen)]
+            earlier += [first] if all(one is not first for one in earlier) else []
             starts = [_carried(geometric[t - way], geometric[t], states[-1], g.spacing)]
             if len(states) > 1:
                 starts.insert(0, _continued(states[-2], states[-1]))
