@@ -182,9 +182,12 @@ def _those_that_are_there(
     while True:
         left = eliminate(model, evidence, criterion, count or None)
         curve = (*(step for step in curve if step.bodies > left.curve[0].bodies), *left.curve)
-        model, evidence = reassign(left.model, left.evidence, 3).compact(), left.evidence
+        evidence = left.evidence
+        model = reassign(left.model, evidence, 3).compact()
         confidence = confidences(model, evidence, criterion)
         if count or (confidence >= _IS_ONE).all():
+            if evidence.ray is None:  # where the first groups' borders are kept, see `remove`
+                model, confidence = left.model, confidences(left.model, evidence, criterion)
             return model, evidence, curve, confidence
 
 
