@@ -130,7 +130,4 @@ def remove(candidate: Candidate, model: BodyModel, evidence: Evidence) -> tuple[
     partner[orphaned], fraction[orphaned] = -1, 1.0
     left = replace(model, label=label, partner=partner, fraction=fraction)
     evidence = settle_rest(left, evidence)
-    left = refit(left, evidence, affected)
-    # The first groups' borders are kept, as turns of the surface drew them: were samples to choose anew each time, they
-    # would follow whatever body happens to suit their noise or the skin's give. Depths of rays leave no such borders.
-    return left if evidence.ray is None else reassign(left, evidence, 1), evidence
+    return reassign(refit(left, evidence, affected), evidence, 1), evidence
