@@ -28,7 +28,9 @@ _SPREAD = (3.0, 1.0)  # pixels between those of a window, on coarse and on fine 
 _NORMAL = 1.4826  # standard deviation of a normal distribution, from its median distance
 _DEPARTED = 3.0  # squared differences of so many times the median lose three quarters of their weight
 _LEAST = 1e-6  # squared grey levels; images that are even differ by less
-_APART = 2.0  # node spacings between two places of a node, of which one is wrong
+# Node spacings between two places of a node, of which one is wrong: limbs that were lost were off by three and more,
+# and of less than one a fit takes care. No other value was tried.
+_APART = 2.0
 _TORN = 1e-3  # of its stiffness a torn edge keeps: a node that nothing else holds stays beside its neighbours
 _CORRELATED = 0.3  # of the points' pull is counted: a hull's errors are alike over a piece of it
 
@@ -112,8 +114,7 @@ class ImageMotion:
 
         for t in range(reference + way, len(frames) if way > 0 else -1, way):
             images = read(t)
-            earlier = [seen[-k] for k in EARLIER if k <= len(seen)]
-            earlier += [first] if all(one is not first for one in earlier) else []
+            earlier = _compared_with(seen, first)
             starts = [_carried(geometric[t - way], geometric[t], states[-1], g.spacing)]
             if len(states) > 1:
                 starts.insert(0, _continued(states[-2], states[-1]))
@@ -126,7 +127,7 @@ class ImageMotion:
             new = np.isnan(homes[:, 0])
             homes[new] = find_homes(g, *states[-1], known, t)[new]
             if self._apart(states[-1], starts[0]).any():
-                self._follow_back(frames[reference::way], lambda k: marks_of(reference + way * k), states, seen)
+                self._follow_back(frames[reference::way], lambda k: marks_of(reference + way * k), states, seen, first)
             seen = [*seen[-max(EARLIER) + 1 :], self._seen(images, states[-1])]
         return states
 
@@ -136,6 +137,7 @@ class ImageMotion:
         marks: Callable[[int], AnchorPoints],
         states: list[NodeState],
         seen: list[_Earlier],
+        first: _Earlier,
     ) -> None:
         """Put limbs that the last state has found again right in the states before it, in place, while that is better.
 
@@ -146,10 +148,12 @@ class ImageMotion:
         states : list of NodeState
         seen : list of _Earlier
             Of the states before the last one, as many as are known.
+        first : _Earlier
+            Of the reference frame.
         """
         for back in range(1, min(len(seen), len(states) - 1)):
             k = len(states) - 1 - back
-            images, earlier = seen[-back].images, [seen[-back - e] for e in EARLIER if back + e <= len(seen)]
+            images, earlier = seen[-back].images, _compared_with(seen[:-back], first)
             after = states[k + 1] if back < 2 else _continued(states[k + 2], states[k + 1])
             start = _with_limbs(states[k], after, self._apart(states[k], states[k + 1]))
             levels = ((states[k], (1,)), (start, (0, 1)))
@@ -291,6 +295,12 @@ def _continued(before: NodeState, last: NodeState) -> NodeState:
     """Go on with the motion of the last frame."""
     (x0, R0), (x, R) = before, last
     return 2 * x - x0, R @ R0.transpose(0, 2, 1) @ R
+
+
+def _compared_with(seen: list[_Earlier], first: _Earlier) -> list[_Earlier]:
+    """Those of the frames before that images are compared with, and the reference frame."""
+    earlier = [seen[-k] for k in EARLIER if k <= len(seen)]
+    return earlier if any(one is first for one in earlier) else [*earlier, first]
 
 
 def _with_limbs(state: NodeState, other: NodeState, nodes: np.ndarray) -> NodeState:

@@ -1,4 +1,4 @@
-"""Nodes followed in images: the kernel against NumPy, and a ball whose turning only images show."""
+"""Nodes followed in images: the kernel against NumPy, a ball whose turning only they show, and a limb that was lost."""
 
 from __future__ import annotations
 
@@ -6,12 +6,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.nodes.anchors import Anchors
+from geomocap.nodes.correspondences import Target
 from geomocap.nodes.image_pull import HALF, FrameImages, window_pulls
 from geomocap.nodes.node_settings import NodeTrackingSettings
-from geomocap.nodes.node_tracking import track_nodes
+from geomocap.nodes.node_tracking import NodeModel, track_nodes
+from geomocap.nodes.surface_points import point_set
+from tests.geomocap.test_nodes_tracking import SMALL, bend, capsule
 
 RADIUS, DISTANCE, FOCAL, SIZE = 0.5, 3.0, 240.0, 120
 TURN_DEG = 4.0  # a frame
@@ -185,3 +190,39 @@ def reference_pull(
     g = np.einsum("ni,nik->nk", slope, jacobian)
     g, r = g - g.mean(axis=0), r - r.mean()
     return g.T @ g, g.T @ r, float(r @ r), len(r)
+
+
+BENDS = np.deg2rad([0.0, 0.0, 90.0, 90.0, 90.0, 90.0])
+REGAINED = 4
+"""Frame of BENDS from which the geometry has the limb."""
+
+
+def even(frame: int) -> FrameImages:
+    """Images of one camera in which nothing can be told."""
+    return FrameImages.of(
+        BallViews(
+            levels=np.zeros((2, 1, 16, 16), np.float32),
+            masks=np.ones((1, 16, 16), np.uint8),
+            depth=np.full((1, 16, 16), 5.0, np.float32),
+            projections=np.array([[[8.0, 0, 8, 40], [0, 8, 8, 40], [0, 0, 1, 5]]]),
+            voxel_size=0.01,
+        )
+    )
+
+
+def test_a_lost_limb_is_found_again_and_followed_back():
+    frames = [point_set(bend(capsule(1200, seed=k), a), 1200, 12) for k, a in enumerate(BENDS)]
+    model = NodeModel(frames[0], SMALL)
+    at_rest, still = model.graph.nodes, np.tile(np.eye(3), (len(model.graph.nodes), 1, 1))
+    truth = [bend(at_rest, a) for a in BENDS]
+    geometric = [(truth[k] if k >= REGAINED else at_rest, still) for k in range(len(frames))]
+    targets = [Target(frame, np.zeros(0)) for frame in frames]
+
+    states = model.image_motion().follow(targets, even, geometric, 0, 1, Anchors.none(len(frames)))
+
+    limb = at_rest[:, 0] > 0.65
+    far = [float(np.median(np.linalg.norm(x - y, axis=1)[limb])) for (x, _), y in zip(states, truth, strict=True)]
+    spacing = model.graph.spacing
+    assert max(far) < spacing, far  # without, six spacings in frames 2 and 3
+    where = cKDTree(frames[2].positions).query(model.graph.deform(*states[2])[0])[0]
+    assert np.median(where) < 0.3 * spacing
