@@ -107,7 +107,11 @@ def _changed(before: BodyModel, after: BodyModel, evidence: Evidence) -> list[in
 
 
 def remove(candidate: Candidate, model: BodyModel, evidence: Evidence) -> tuple[BodyModel, Evidence]:
-    """Take a body away: its samples go to the neighbour that turns alike, or to blends of the neighbours."""
+    """Take a body away: its samples go to the neighbour that turns alike, or to blends of the neighbours.
+
+    All others stay, for the borders of the first grouping are truer than those of samples that choose anew, which drift
+    on soft skin. Where single cameras follow the surface all choose anew, as each body puts them at another depth.
+    """
     body = candidate.body
     gone = np.flatnonzero(model.label == body)
     label, partner, fraction = model.label.copy(), model.partner.copy(), model.fraction.copy()
@@ -130,4 +134,5 @@ def remove(candidate: Candidate, model: BodyModel, evidence: Evidence) -> tuple[
     partner[orphaned], fraction[orphaned] = -1, 1.0
     left = replace(model, label=label, partner=partner, fraction=fraction)
     evidence = settle_rest(left, evidence)
-    return reassign(refit(left, evidence, affected), evidence, 1), evidence
+    left = refit(left, evidence, affected)
+    return (left if evidence.ray is None else reassign(left, evidence, 1)), evidence

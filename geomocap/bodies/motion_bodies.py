@@ -186,7 +186,7 @@ def _those_that_are_there(
         model = reassign(left.model, evidence, 3).compact()
         confidence = confidences(model, evidence, criterion)
         if count or (confidence >= _IS_ONE).all():
-            if evidence.ray is None:  # the borders before that are truer: samples follow what suits their noise
+            if evidence.ray is None:  # the borders before that are truer
                 model, confidence = left.model, confidences(left.model, evidence, criterion)
             return model, evidence, curve, confidence
 
