@@ -73,8 +73,8 @@ class _Model:
 def match_tree(posture: MeanPosture, template: NameTemplate, least: float = -np.inf) -> list[TreeMatch]:
     """Match the joints of a posture to a template: the likeliest way, and others that are not much less likely.
 
-    The others are the best ones with the subject facing another way, with left and right exchanged, and with one joint
-    each taken for something else, or for nothing that the template has.
+    The others are the best ones with the subject facing another way, with one joint each taken for something else, or
+    for nothing that the template has, and the best one of all with left and right exchanged.
 
     Parameters
     ----------
@@ -104,32 +104,41 @@ def match_tree(posture: MeanPosture, template: NameTemplate, least: float = -np.
         if np.isfinite(score) and (known is None or known.score < score):
             ways[chosen.tobytes()] = _match(found, chosen, turn, score, _symmetry(found, model, turn, chosen))
 
-    best = -1, least + SURE
-    for i, (bound, cue, turn, gains) in enumerate(tries):
-        if bound > max(best[1] - SURE, least):
-            chosen = _assign(found, model, gains, max(best[1] - SURE, least) - cue)
+    best = least + SURE
+    facing: list[tuple[float, np.ndarray, float, np.ndarray, np.ndarray]] = []
+    for bound, cue, turn, gains in tries:
+        if bound > max(best - SURE, least):
+            chosen = _assign(found, model, gains, max(best - SURE, least) - cue)
             if chosen is not None:
                 keep(chosen, cue, turn, gains)
                 score = cue + _sum(gains, chosen)
-                best = (i, score) if best[0] < 0 or score > best[1] else best
-    if best[0] < 0:
+                best = score if not facing else max(best, score)
+                facing.append((score, chosen, cue, turn, gains))
+    if not facing:
         return []
-    _, cue, turn, gains = tries[best[0]]
-    chosen = _assign(found, model, gains)
-    assert chosen is not None, "the best way above was one"
-    for v in np.flatnonzero(chosen >= 0).tolist():
-        part = int(chosen[v]) + 1
-        nothing = list(range(1, len(template.parts)))
-        for barred in ([part], [part, int(template.mirrored[part])], nothing):
-            without = gains.copy()
-            without[np.ix_(found.joint == found.joint[v], np.array(barred) - 1)] = -np.inf
-            other = _assign(found, model, without, best[1] - SURE - cue)
-            if other is not None:
-                keep(other, cue, turn, gains)
+    # what else joints may be is asked of each direction that may be that of the subject
+    for score, chosen, cue, turn, gains in facing:
+        if score > best - SURE:
+            for barred in _barred(found, chosen, template):
+                other = _assign(found, model, np.where(barred, -np.inf, gains), best - SURE - cue)
+                if other is not None:
+                    keep(other, cue, turn, gains)
+    chosen = max(facing, key=lambda one: one[0])[1]
     exchanged = np.where(chosen >= 0, template.mirrored[np.maximum(chosen, 0) + 1] - 1, -1)
     for _, cue, turn, gains in tries:
         keep(exchanged, cue, turn, gains)
     return sorted(ways.values(), key=lambda way: -way.score - way.symmetry)
+
+
+def _barred(found: JointFeatures, chosen: np.ndarray, template: NameTemplate) -> Iterator[np.ndarray]:
+    """What each joint is taken for, (V, K - 1) bool: that part, that or its mirror image, and any part at all."""
+    for v in np.flatnonzero(chosen >= 0).tolist():
+        part = int(chosen[v]) + 1
+        nothing = list(range(1, len(template.parts)))
+        for parts in ([part], [part, int(template.mirrored[part])], nothing):
+            barred = np.zeros((len(chosen), len(template.parts) - 1), bool)
+            barred[np.ix_(found.joint == found.joint[v], np.array(parts) - 1)] = True
+            yield barred
 
 
 def decoy_score(posture: MeanPosture, template: NameTemplate, least: float) -> float:

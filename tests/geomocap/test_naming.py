@@ -148,6 +148,27 @@ def test_a_users_own_template_whose_ends_look_alike_tells_no_left_from_right(tmp
     assert not any(name.endswith(("_left", "_right")) for name in found.bodies.values())
 
 
+def test_both_ways_to_face_are_looked_at_alike_where_the_ends_look_alike(tmp_path):
+    def leg(name, x):
+        upper = f"joint = [{x}, 0.3, 1]\ncenter = [{x}, 0.3, 0.75]\n"
+        lower = f"joint = [{x}, 0.3, 0.5]\ncenter = [{x}, 0.3, 0.25]\ntip = [{x}, 0.3, 0]\n"
+        pair = "pair = true\nsurface = 1\nmobility = 0.2\n"
+        return f"[parts.{name}]\nparent = 'top'\n{pair}{upper}[parts.{name}_foot]\nparent = '{name}'\n{pair}{lower}"
+
+    (tmp_path / "table.toml").write_text(
+        "[parts.top]\ncenter = [0, 0, 1]\nsurface = 6\n" + leg("front", 0.5) + leg("hind", -0.5)
+    )
+    table = read_template(tmp_path / "table.toml")
+    high = table.joint_places.copy()
+    high[[part.endswith("foot") for part in table.parts], 2] += 0.2  # so high that it may be none
+    skeleton = figure(replace(table, joint_places=high), without=[("front_foot", "left")], speed=0.0)[0]
+    ways = match_tree(mean_posture(skeleton, 2), table)
+    forward, backward = (sorted(w.score + w.symmetry for w in ways if sign * w.turn[0, 0] > 0) for sign in (1, -1))
+    assert len(forward) > 5
+    np.testing.assert_allclose(forward[-5:], backward[-5:], atol=0.05)
+    assert set(find_names(skeleton, 2, templates=[table]).bodies.values()) == {"top"}
+
+
 def test_names_of_other_programs():
     found = find_names(figure(HUMAN)[0], 2)
     assert set(renamed(found, "mixamo").bodies.values()) > {"mixamorig:Hips", "mixamorig:LeftForeArm"}
