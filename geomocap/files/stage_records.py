@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -152,6 +153,9 @@ def add_to_journal(run: Path, stage: str, files: Iterable[Path]) -> None:
             # a line begins with its break, so that one which was cut off spoils none that follows
             stream.write("".join(f"\n{line}" for line in lines))
     except OSError as error:
+        with suppress(OSError):
+            if not journal.stat().st_size:
+                journal.unlink()
         where = error.filename or journal
         raise RunError(f"{where}: can't be written ({error.strerror}); free space and start again") from None
 

@@ -37,6 +37,7 @@ from geomocap.files.frame_files import write_points, write_voxels
 from geomocap.files.images import write_image, write_mask
 from geomocap.files.npz import write_npz
 from geomocap.files.rigs import read_rig
+from geomocap.files.stage_records import FOLDER, add_to_journal
 from geomocap.model.frame_geometry import BodyPoints, Voxels
 from tests.disks import no_file_beyond, small_disk
 from tests.geomocap.articulated import skeleton_arrays, skeleton_of
@@ -129,6 +130,18 @@ def test_a_small_disk_says_that_it_is_full(tmp_path):
             else:
                 pytest.fail("it has room for everything")
             assert not list(disk.glob(".*"))
+
+
+def test_a_journal_that_got_no_line_is_not_left_behind(tmp_path):
+    (tmp_path / FOLDER).mkdir()
+    (tmp_path / "a.ply").write_bytes(b"x")
+    with no_file_beyond(0), pytest.raises(RunError, match="free space"):
+        add_to_journal(tmp_path, "voxels", [tmp_path / "a.ply"])
+    assert not list((tmp_path / FOLDER).iterdir())
+    add_to_journal(tmp_path, "voxels", [tmp_path / "a.ply"])
+    with no_file_beyond(0), pytest.raises(RunError):
+        add_to_journal(tmp_path, "voxels", [tmp_path / "a.ply"])
+    assert (tmp_path / FOLDER / "voxels.journal").read_text().count("a.ply") == 1
 
 
 def test_a_folder_is_swapped_as_a_whole_and_other_files_stay(tmp_path):
