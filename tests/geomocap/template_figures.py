@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from importlib import resources
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geomocap.model.hierarchy import Hierarchy
 from geomocap.model.skeleton import Skeleton, bone_fixed_skeleton
-from geomocap.naming.name_templates import NameTemplate
+from geomocap.naming.name_templates import NameTemplate, read_template
 
 
 def figure(
@@ -63,3 +65,17 @@ def figure(
     centers = origins + np.einsum("tbij,bj->tbi", world, middle - origin)
     skeleton = bone_fixed_skeleton(hierarchy, joints, world, origins[:, 1:], centers, middle, 30.0)
     return skeleton, [labels[k] for k in kept]
+
+
+def with_a_thigh_in_two(folder: Path, cut: float, knee: float = 0.285) -> tuple[Skeleton, list[str]]:
+    """A person whose left thigh is two bodies, parted at a height; heights in shares of the person's."""
+    text = (resources.files("geomocap.naming") / "templates" / "human.toml").read_text()
+    top, rest = text.split("[parts.thigh]")
+    thigh, rest = rest.split("[parts.shank]")
+    piece = (
+        f"[parts.thigh_low]\npair = true\nparent = 'thigh'\njoint = [0.04, 0.06, {cut}]\n"
+        f"center = [0.03, 0.06, {(cut + knee) / 2}]\nsurface = 0.5\nmobility = 0.5\n\n"
+    )
+    low = rest.replace('parent = "thigh"', 'parent = "thigh_low"', 1).replace("0.285]", f"{knee}]", 1)
+    (folder / "long.toml").write_text(f"{top}[parts.thigh]{thigh}{piece}[parts.shank]{low}")
+    return figure(read_template(folder / "long.toml"), without=[("thigh_low", "right")])
