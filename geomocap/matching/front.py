@@ -129,17 +129,14 @@ class Front:
         """
         if len(targets) == 0:
             return
-        images, settings = self.images, self.settings
+        settings = self.settings
         larger, smaller = round(settings.radius * settings.larger), max(round(settings.radius / settings.larger), 3)
         # A handful of points is not worth waking the other threads for
         threads = numba.get_num_threads()
         numba.set_num_threads(threads if len(targets) > _FEW else 1)
         try:
             gk.match_cells(
-                images.flat,
-                images.masks,
-                images.layout,
-                images.order,
+                self.images.arrays,
                 self.template,
                 self.searches,
                 self.transfers,
@@ -151,9 +148,7 @@ class Front:
                 np.array([smaller if hole else settings.radius, larger, smaller]),
                 not hole,
                 self.planes,
-                self.position,
-                self.affine,
-                self.quality,
+                (self.position, self.affine, self.quality),
             )
         finally:
             numba.set_num_threads(threads)

@@ -112,36 +112,24 @@ def match_point(stack, template, searches, transfers, limits, x, y, radius, plan
     `plane` (PLANE,) is replaced by the plane found. Returns the number of images (0: rejected; the reasons then stand
     in `quality`).
     """
-    flat, masks, layout, order = stack
+    _, masks, layout, _ = stack
     kernel, wanted, point, first = work
     images = len(searches)
     wanted[:] = 1
+    control = (
+        limits[SIGMA_CONDITION],
+        int(limits[ITERATIONS]),
+        limits[TOLERANCE],
+        limits[CONTRAST],
+        limits[MAX_SHIFT],
+        _PATIENCE,
+        limits[MIN_CORRELATION] - _SHORT,
+    )
     for attempt in range(2):
         if not plane_start(transfers, x, y, plane, position, affine, point):
             return 0
         survived = match_patch(
-            flat,
-            masks,
-            layout,
-            order,
-            template,
-            searches,
-            transfers,
-            limits[SIGMA_CONDITION],
-            x,
-            y,
-            radius,
-            int(limits[ITERATIONS]),
-            limits[TOLERANCE],
-            limits[CONTRAST],
-            limits[MAX_SHIFT],
-            _PATIENCE,
-            limits[MIN_CORRELATION] - _SHORT,
-            wanted,
-            position,
-            affine,
-            quality,
-            kernel,
+            stack, template, searches, transfers, x, y, radius, control, wanted, position, affine, quality, kernel
         )
         # A view alone with the template has nothing to contradict it: it has to be the better.
         floor = limits[MIN_CORRELATION] if survived > 1 else limits[PAIR_CORRELATION]
@@ -181,30 +169,13 @@ def carry(plane, dx, dy, out):
 
 @njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def match_cells(
-    flat,
-    masks,
-    layout,
-    order,
-    template,
-    searches,
-    transfers,
-    limits,
-    points,
-    cells,
-    origins,
-    starts,
-    radii,
-    half,
-    planes,
-    position,
-    affine,
-    quality,
+    stack, template, searches, transfers, limits, points, cells, origins, starts, radii, half, planes, found
 ):
     """Match cells, each once, from planes that hold near them, adapting where the quality is poor.
 
     Parameters
     ----------
-    flat, masks, layout, order, template, searches, transfers
+    stack, template, searches, transfers
         As in `match_patch`.
     limits : (LIMITS,) float
         Thresholds.
@@ -220,10 +191,11 @@ def match_cells(
         Patch radius; the one where texture is short; the one where the surface is not plane enough.
     half : bool
         Whether a point half way is matched first where nothing else helps.
-    planes, position, affine, quality : (N, PLANE), (N, K, 2), (N, K, 4), (N, K, COLUMNS) float
-        Written for the cells; IMAGES = 0 where none matched, the reasons then those of the first try.
+    planes : (N, PLANE) float
+    found : position (N, K, 2), affine (N, K, 4), quality (N, K, COLUMNS)
+        Both written for the cells; IMAGES = 0 where none matched, the reasons then those of the first try.
     """
-    stack = (flat, masks, layout, order)
+    position, affine, quality = found
     images = len(searches)
     count = len(cells)
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
@@ -255,10 +227,10 @@ def match_cells(
                         break
                     carry(between, 0.5 * dx, 0.5 * dy, plane)
                 args = (stack, template, searches, transfers, limits, x, y, radius, plane, p, a, q, work)
-                found = match_point(*args)
-                if found > 0 or attempt == 0:
+                passed = match_point(*args)
+                if passed > 0 or attempt == 0:
                     quality[cell] = q
-                if found > 0:
+                if passed > 0:
                     position[cell], affine[cell], planes[cell] = p, a, plane
                     break
                 if attempt == 0:

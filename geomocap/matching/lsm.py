@@ -36,7 +36,7 @@ geometric condition; half of it belongs to either image, which is what `triangul
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
@@ -44,7 +44,7 @@ from numba import njit, prange
 from geomocap.matching import patch_kernel as kernel
 from geomocap.matching.matching_settings import KernelSettings
 from geomocap.matching.patch_kernel import match_patch, workspace
-from geomocap.matching.spline import ImageStack, SplineImage
+from geomocap.matching.spline import ImageStack
 
 REASONS = (
     "matched",
@@ -117,61 +117,11 @@ class Matches:
         """Which adjustments converged, (…,) bool."""
         return self.status == kernel.MATCHED
 
-    @property
-    def sx(self) -> np.ndarray:
-        """Standard deviation in x, (…,) float, pixels."""
-        return np.sqrt(self.covariance[..., 0, 0])
-
-    @property
-    def sy(self) -> np.ndarray:
-        """Standard deviation in y, (…,) float, pixels."""
-        return np.sqrt(self.covariance[..., 1, 1])
-
-    @property
-    def reasons(self) -> dict[str, int]:
-        """How many points came to which end, by the words of `REASONS`."""
-        return count_reasons(self.status)
-
-    def search(self, k: int) -> Matches:
-        """Return the matches (N,) in search image `k` of matches (N, K)."""
-        return Matches(*(getattr(self, f.name)[:, k] for f in fields(self)))
-
 
 def count_reasons(status: np.ndarray) -> dict[str, int]:
     """Count the outcomes `status` (any shape, numbers of `REASONS`) by their words."""
     counts = Counter(np.asarray(status).ravel().tolist())
     return {REASONS[code]: counts[code] for code in sorted(counts)}
-
-
-def match_pairs(
-    template: SplineImage,
-    search: SplineImage,
-    points: np.ndarray,
-    start: np.ndarray,
-    settings: KernelSettings | None = None,
-) -> Matches:
-    """Match patches of one image in another, each for itself.
-
-    Parameters
-    ----------
-    template, search : SplineImage
-        Of the same spline order.
-    points : (N, 2) float
-        Centres of the template patches, COLMAP pixels; need not be pixel centres.
-    start : (N, 2) or (N, 6) float
-        Start positions in the search image, COLMAP pixels, and affine matrices (a11, a12, a21, a22), the identity if
-        not given.
-    settings : KernelSettings, optional
-
-    Returns
-    -------
-    matches : Matches
-        Of leading shape (N,).
-    """
-    settings = settings or KernelSettings()
-    start = np.asarray(start, dtype=np.float64)
-    stack = template.stack.join(search.stack)
-    return match_multi(stack, 0, [1], points, start[:, None], None, settings).search(0)
 
 
 def match_multi(
@@ -224,20 +174,21 @@ def match_multi(
     affine = np.ascontiguousarray(start[..., 2:]) if start.shape[2] == 6 else np.tile([1.0, 0, 0, 1], (*shape, 1))
     quality = np.zeros((*shape, kernel.COLUMNS))
     _match_all(
-        images.flat,
-        images.masks,
-        images.layout,
-        images.order,
+        images.arrays,
         template,
         searches,
         np.zeros((len(searches), 12)) if transfers is None else np.ascontiguousarray(transfers, dtype=np.float64),
-        0.0 if transfers is None else settings.sigma_condition,
         points - 0.5,
         settings.radius,
-        settings.iterations,
-        settings.tolerance,
-        settings.minimum_contrast,
-        settings.max_shift,
+        (
+            0.0 if transfers is None else settings.sigma_condition,
+            settings.iterations,
+            settings.tolerance,
+            settings.minimum_contrast,
+            settings.max_shift,
+            _PATIENCE,
+            _HOPELESS,
+        ),
         position,
         affine,
         quality,
@@ -266,51 +217,12 @@ def matches_of(position: np.ndarray, affine: np.ndarray, quality: np.ndarray, st
 
 
 @njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def _match_all(
-    flat,
-    masks,
-    layout,
-    order,
-    template,
-    searches,
-    transfers,
-    sigma_condition,
-    points,
-    radius,
-    iterations,
-    tolerance,
-    minimum_contrast,
-    max_shift,
-    position,
-    affine,
-    quality,
-):
+def _match_all(stack, template, searches, transfers, points, radius, control, position, affine, quality):
     count = len(points)
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
         work = workspace(radius, len(searches))
         wanted = np.ones(len(searches), np.uint8)
         for n in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
-            match_patch(
-                flat,
-                masks,
-                layout,
-                order,
-                template,
-                searches,
-                transfers,
-                sigma_condition,
-                points[n, 0],
-                points[n, 1],
-                radius,
-                iterations,
-                tolerance,
-                minimum_contrast,
-                max_shift,
-                _PATIENCE,
-                _HOPELESS,
-                wanted,
-                position[n],
-                affine[n],
-                quality[n],
-                work,
-            )
+            x, y = points[n]
+            found = position[n], affine[n], quality[n]
+            match_patch(stack, template, searches, transfers, x, y, radius, control, wanted, *found, work)

@@ -90,50 +90,27 @@ def inverse_depth(transfers, x, y, position, use):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def match_patch(
-    flat,
-    masks,
-    layout,
-    order,
-    template,
-    searches,
-    transfers,
-    sigma_condition,
-    x,
-    y,
-    radius,
-    iterations,
-    tolerance,
-    minimum_contrast,
-    max_shift,
-    patience,
-    hopeless,
-    wanted,
-    position,
-    affine,
-    quality,
-    work,
-):
+def match_patch(stack, template, searches, transfers, x, y, radius, control, wanted, position, affine, quality, work):
     """Match the patch around template index position (x, y) in all search images at once.
 
     Parameters
     ----------
-    flat, masks, layout, order : the arrays of an `ImageStack`
+    stack : tuple
+        `ImageStack.arrays`.
     template : int
     searches : (K,) int64
         Their numbers in the stack.
     transfers : (K, 12) float
         Epipolar geometry of each search image (see `transfer`).
-    sigma_condition : float
-        Standard deviation of the condition that the rays meet, pixels; 0: no condition.
-    radius, iterations, tolerance : patch radius, limit of iterations, step at which they end, pixels
-    minimum_contrast : float
-        Least standard deviation of the template's grey levels.
-    max_shift : float
-        Farthest that a position may move from its start, pixels; 0: anywhere.
-    patience, hopeless : int, float
-        An image is given up whose correlation is below `hopeless` after `patience` iterations, or below half of it
-        after half as many.
+    radius : int
+        Of the patch, pixels.
+    control : tuple
+        sigma_condition : standard deviation of the condition that the rays meet, pixels; 0: no condition;
+        iterations, tolerance : their limit, and the step at which they end, pixels;
+        minimum_contrast : least standard deviation of the template's grey levels;
+        max_shift : farthest that a position may move from its start, pixels; 0: anywhere;
+        patience, hopeless : an image is given up whose correlation is below `hopeless` after `patience` iterations, or
+        below half of it after half as many.
     wanted : (K,) uint8
         1 for the search images to match in.
     position : (K, 2) float, affine : (K, 4) float
@@ -148,6 +125,8 @@ def match_patch(
     matched : int
         Number of images in which the adjustment converged.
     """
+    flat, masks, layout, order = stack
+    sigma_condition, iterations, tolerance, minimum_contrast, max_shift, patience, hopeless = control
     patches, wx, wy, index, G, N, small, v, factors, systems, state = work
     q1, qf, b, d, moments, sums, point = v[0], v[1], v[2], v[3], v[8], v[9], v[10]
     L0 = small[4]

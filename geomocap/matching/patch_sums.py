@@ -90,6 +90,28 @@ def template_mask(masks, start, stride, ix, iy, radius, W):
     return count
 
 
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER, inline="always")
+def _add_first_moments(sums, gx, gx_x, gy, gy_x, y):
+    """Add a row's sums of ∇F and x ∇F, in the order of the parameters."""
+    sums[0] += gx
+    sums[1] += gx_x
+    sums[2] += gx * y
+    sums[3] += gy
+    sums[4] += gy_x
+    sums[5] += gy * y
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER, inline="always")
+def _add_second_moments(sums, g, g_x, g_xx, y):
+    """Add a row's sums of a product of slopes times 1, x and x² to those times 1, x, y, x², x y and y²."""
+    sums[0] += g
+    sums[1] += g_x
+    sums[2] += g * y
+    sums[3] += g_xx
+    sums[4] += g_x * y
+    sums[5] += g * y * y
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER)
 def normal_equations(patches, radius, count, H, S, q1, qf, moments):
     """Centre F, form the 6×6 normal matrix from row moments and eliminate offset and gain; return Σ F²."""
@@ -150,36 +172,11 @@ def normal_equations(patches, radius, count, H, S, q1, qf, moments):
             fr += f * f
             m0 += w
             m2 += w * x * x
-        S[0, 0] += a0
-        S[0, 1] += a1
-        S[0, 2] += a0 * y
-        S[0, 3] += a2
-        S[0, 4] += a1 * y
-        S[0, 5] += a0 * y * y
-        S[1, 0] += b0
-        S[1, 1] += b1
-        S[1, 2] += b0 * y
-        S[1, 3] += b2
-        S[1, 4] += b1 * y
-        S[1, 5] += b0 * y * y
-        S[2, 0] += c0
-        S[2, 1] += c1
-        S[2, 2] += c0 * y
-        S[2, 3] += c2
-        S[2, 4] += c1 * y
-        S[2, 5] += c0 * y * y
-        q1[0] += u0
-        q1[1] += u1
-        q1[2] += u0 * y
-        q1[3] += v0
-        q1[4] += v1
-        q1[5] += v0 * y
-        qf[0] += s0
-        qf[1] += s1
-        qf[2] += s0 * y
-        qf[3] += t0
-        qf[4] += t1
-        qf[5] += t0 * y
+        _add_second_moments(S[0], a0, a1, a2, y)
+        _add_second_moments(S[1], b0, b1, b2, y)
+        _add_second_moments(S[2], c0, c1, c2, y)
+        _add_first_moments(q1, u0, u1, v0, v1, y)
+        _add_first_moments(qf, s0, s1, t0, t1, y)
         moments[0] += m0
         moments[1] += m2
         moments[2] += m0 * y * y
@@ -295,12 +292,7 @@ def sample_and_project(flat, start, stride, order, px, py, warp, radius, patches
         t1 += s1
         t2 += s2
         y = float(i - radius)
-        b[0] += e0
-        b[1] += e1
-        b[2] += e0 * y
-        b[3] += e2
-        b[4] += e3
-        b[5] += e2 * y
+        _add_first_moments(b, e0, e1, e2, e3, y)
     sums[1] = t0
     sums[2] = t1
     sums[3] = t2

@@ -26,10 +26,9 @@ multiplications with additions, a first run would differ from later ones in the 
 
 _F4 = np.float32
 _SIXTH = _F4(1 / 6)
-_I24 = _F4(1 / 24)
 _I120 = _F4(1 / 120)
 _1, _2, _3, _4, _5, _6 = (_F4(v) for v in (1, 2, 3, 4, 5, 6))
-_HALF, _20, _26, _30, _50, _60, _66, _10 = (_F4(v) for v in (0.5, 20, 26, 30, 50, 60, 66, 10))
+_20, _26, _30, _50, _60, _66, _10 = (_F4(v) for v in (20, 26, 30, 50, 60, 66, 10))
 
 
 @dataclass(frozen=True)
@@ -55,6 +54,11 @@ class ImageStack:
 
     def __len__(self) -> int:
         return len(self.layout)
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+        """What kernels take: coefficients, masks, layout and order."""
+        return self.flat, self.masks, self.layout, self.order
 
     @classmethod
     def of(
@@ -104,52 +108,12 @@ class ImageStack:
             order,
         )
 
-    def select(self, images: Sequence[int]) -> ImageStack:
-        """Return a stack of these images, in this order, sharing the coefficients."""
-        return ImageStack(self.flat, self.masks, np.ascontiguousarray(self.layout[list(images)]), self.order)
-
-    def join(self, other: ImageStack) -> ImageStack:
-        """Return a stack of these images followed by those of `other`, which must have the same order."""
-        if other.order != self.order:
-            raise ValueError(f"splines of order {self.order} and {other.order} can't be matched with each other")
-        layout = other.layout.copy()
-        layout[:, 0] += len(self.flat)
-        return ImageStack(
-            np.concatenate([self.flat, other.flat]),
-            np.concatenate([self.masks, other.masks]),
-            np.concatenate([self.layout, layout]),
-            self.order,
-        )
-
     def sample(self, image: int, pixels: np.ndarray) -> np.ndarray:
         """Evaluate one image at COLMAP pixels (N, 2): (N,) float32, NaN outside the outermost pixel centres."""
         pixels = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 2)
         out = np.empty(len(pixels), np.float32)
         _sample_points(self.flat, self.layout[image], self.order, pixels, out)
         return out
-
-
-@dataclass(frozen=True)
-class SplineImage:
-    """One image as a spline, ready for matching.
-
-    Attributes
-    ----------
-    stack : ImageStack
-        Holds this image alone.
-    """
-
-    stack: ImageStack
-
-    @classmethod
-    def of(cls, image: np.ndarray, order: int = 3, mask: np.ndarray | None = None) -> SplineImage:
-        """Prefilter a grey image (H, W); `mask` (H, W) is non-zero where it may be used."""
-        return cls(ImageStack.of([image], order, [mask]))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width, pixels."""
-        return int(self.stack.layout[0, 2]), int(self.stack.layout[0, 3])
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER, inline="always")
@@ -179,25 +143,12 @@ def quintic_weights(t, w, j):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER)
-def weights_and_derivatives(order, t, w, j):
-    """Put the weights of spline `order` at fraction `t` into column `j` of `w`, their derivatives into `j + 1`."""
-    u = _1 - t
+def _weights(order, t, w):
+    """Put the weights of spline `order` at fraction `t` into the column of `w`."""
     if order == 3:
-        cubic_weights(t, w, j)
-        w[0, j + 1] = -_HALF * u * u
-        w[1, j + 1] = _HALF * t * (_3 * t - _4)
-        w[2, j + 1] = -_HALF * u * (_3 * u - _4)
-        w[3, j + 1] = _HALF * t * t
+        cubic_weights(t, w, 0)
     else:
-        quintic_weights(t, w, j)
-        t2 = t * t
-        u2 = u * u
-        w[0, j + 1] = -u2 * u2 * _I24
-        w[1, j + 1] = (-_10 + t * (_2 * _4 + t * (_3 * _4 + t * (-_4 * _4 + _5 * t)))) * _I24
-        w[2, j + 1] = t * (-_4 * _6 + t2 * (_4 * _6 - _10 * t)) * _I24
-        w[3, j + 1] = -u * (-_4 * _6 + u2 * (_4 * _6 - _10 * u)) * _I24
-        w[4, j + 1] = -(-_10 + u * (_2 * _4 + u * (_3 * _4 + u * (-_4 * _4 + _5 * u)))) * _I24
-        w[5, j + 1] = t2 * t2 * _I24
+        quintic_weights(t, w, 0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", parallel=True)
@@ -209,12 +160,11 @@ def _sample_points(flat, layout, order, pixels, out):
         if not (x >= 0 and y >= 0 and x <= width - 1 and y <= height - 1):
             out[n] = np.nan
             continue
-        wx = np.empty((6, 2), np.float32)
-        wy = np.empty((6, 2), np.float32)
+        wx, wy = np.empty((6, 1), np.float32), np.empty((6, 1), np.float32)
         ix = int(x)
         iy = int(y)
-        weights_and_derivatives(order, np.float32(x - ix), wx, 0)
-        weights_and_derivatives(order, np.float32(y - iy), wy, 0)
+        _weights(order, np.float32(x - ix), wx)
+        _weights(order, np.float32(y - iy), wy)
         taps = order + 1
         base = start + (iy - order // 2) * stride + ix - order // 2
         value = np.float32(0)

@@ -23,11 +23,10 @@ from geomocap.dense.dense_frame import CloudFrame, cloud_of_frame
 from geomocap.dense.match_groups import match_groups
 from geomocap.files.images import read_image
 from geomocap.files.rigs import read_rig
-from geomocap.matching.lsm import match_pairs
 from geomocap.matching.matching_settings import KernelSettings
-from geomocap.matching.spline import SplineImage
 from geomocap.model.rig import Rig
 from tests.benchmarks.table import Row
+from tests.geomocap.image_pairs import deviations, match_pairs, pair
 from tests.geomocap.speckle import Speckle, recorded
 from viz.matching_review import surface_errors
 
@@ -58,19 +57,19 @@ def kernel_rows() -> list[Row]:
     rows = []
     for radius, order in ((10, 3), (10, 5), (7, 3)):
         settings = KernelSettings(radius=radius, order=order)
-        template, search = SplineImage.of(f, order), SplineImage.of(g, order)
-        match_pairs(template, search, points, start, settings)
+        both = pair(f, g, order)
+        match_pairs(both, points, start, settings)
         competitors = {"cv2.findTransformECC": _ecc, "cv2.calcOpticalFlowPyrLK": _pyramid_lk}
         for name, competitor in competitors.items():
             ours, theirs = [], []
             for _ in range(5):
                 begin = time.perf_counter()
-                m = match_pairs(template, search, points, start, settings)
+                m = match_pairs(both, points, start, settings)
                 ours.append(time.perf_counter() - begin)
                 seconds, error = competitor(f, g, points, start, true, radius)
                 theirs.append(seconds)
             e, ok = m.positions - true, m.matched
-            ratio = (e / np.stack([m.sx, m.sy], axis=-1))[ok].std()
+            ratio = (e / deviations(m))[ok].std()
             rows.append(
                 Row(
                     f"match {len(points)} patches {2 * radius + 1}×{2 * radius + 1}, order {order}",

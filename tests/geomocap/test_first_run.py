@@ -14,11 +14,10 @@ views = [MovingEllipsoid().view(k) for k in range(6)]
 found = track_surface(lambda k: views[k], len(views), SETTINGS)
 """
 MATCHING = """
-from geomocap.matching.lsm import match_pairs
-from geomocap.matching.spline import SplineImage
+from tests.geomocap.image_pairs import match_pairs, pair
 from tests.geomocap.test_matching_lsm import AFFINE, CENTER, HEIGHT, SHIFT, SPECKLE, WIDTH, grid, warped
 images = SPECKLE.render(HEIGHT, WIDTH), SPECKLE.render(HEIGHT, WIDTH, AFFINE, SHIFT, CENTER)
-found = match_pairs(*(SplineImage.of(image) for image in images), grid(), warped(grid()).round())
+found = match_pairs(pair(*images), grid(), warped(grid()).round())
 """
 PRINT = "import hashlib; print(hashlib.sha256(found.positions.tobytes()).hexdigest())\n"
 
