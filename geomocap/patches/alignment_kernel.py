@@ -45,24 +45,13 @@ def align_patches(
     which,
     X,
     Q,
-    shape,
-    size,
-    rows,
-    templates,
-    usable,
-    doubt,
+    patches,
     use,
-    images,
+    views,
     level,
     stride,
-    masks,
     use_mask,
-    P,
-    centers,
-    prior_X,
-    prior_Q,
-    prior_shift,
-    prior_turn,
+    prior,
     iterations,
     least_correlation,
     correlation,
@@ -78,30 +67,20 @@ def align_patches(
         Patches to align.
     X, Q : (N, 3), (N, 3, 3) float
         Places at the start; replaced by those found.
-    shape : (N, M, 5) float
-    size : (N,) float
-        What a pixel covers on the patch, metres: the unit in which steps are limited.
-    rows : (N,) int
-        Where the patches have their templates.
-    templates : (R, C, L, M, 3) float32
-    usable : (R, C, M) uint8
-    doubt : (N, C) float
-        Standard deviation of the place at which each template was taken, metres.
+    patches : shape (N, M, 5), size (N,), rows (N,) int, templates (R, C, L, M, 3), usable (R, C, M), doubt (N, C)
+        Arrays of `Patches` and of their store. The size is the unit in which steps are limited.
     use : (N, C) uint8
         Cameras to align with.
-    images : (C, H, W) float32
+    views : images (C, H, W) float32, masks (C, H, W) uint8, projections (C, 3, 4), centers (C, 3)
+        Arrays of `FrameViews`.
     level : int
         Level of the templates.
     stride : int
         Use every so many of the samples; 2 is a chequerboard, enough for blurred images.
-    masks : (C, H, W) uint8
     use_mask : bool
         Whether samples outside the silhouettes are left out.
-    P, centers : (C, 3, 4), (C, 3) float
-    prior_X, prior_Q : (N, 3), (N, 3, 3) float
-        Where the patches are expected.
-    prior_shift, prior_turn : (N,) float
-        Standard deviations of that, metres and radians.
+    prior : X (N, 3), Q (N, 3, 3), shift (N,), turn (N,)
+        Where the patches are expected, and standard deviations of that, metres and radians.
     iterations : int
         At most; 0 only compares.
     least_correlation : float
@@ -111,18 +90,17 @@ def align_patches(
     covariance : (N, 6) float
         Filled: variances of shift (m²) and turn (rad²) along the patch's own axes; NaN without solution.
     """
+    shape, size, rows, templates, usable, doubt = patches
+    images, masks, P, centers = views
+    prior_X, prior_Q, prior_shift, prior_turn = prior
     M = shape.shape[1]
     C = use.shape[1]
     A = np.empty((C, 3, 4))
     J = np.empty((C, 6, M), np.float32)
     T = np.empty((C, M), np.float32)
     places = np.empty((C, 3, M))
-    at, aside, below, values = (
-        np.empty(M, np.int32),
-        np.empty(M, np.float32),
-        np.empty(M, np.float32),
-        np.empty(M, np.float32),
-    )
+    at = np.empty(M, np.int32)
+    aside, below, values = np.empty(M, np.float32), np.empty(M, np.float32), np.empty(M, np.float32)
     counts = np.empty(C, np.int64)
     variance_t = np.empty(C)
     H = np.empty((C, 6, 6))
@@ -148,21 +126,9 @@ def align_patches(
                 local[r] = 0.0
                 for k in range(3):
                     local[r] += q_n[k, r] * (centers[c, k] - x_n[k])
-            counts[c] = choose_samples(
-                A[c],
-                local,
-                shape[n],
-                templates[rows[n], c, level],
-                usable[rows[n], c],
-                masks[c],
-                use_mask,
-                iterations > 0,
-                stride,
-                places[c],
-                J[c],
-                T[c],
-                moments,
-            )
+            seen_by = templates[rows[n], c, level], usable[rows[n], c], masks[c], use_mask
+            filled = places[c], J[c], T[c], moments
+            counts[c] = choose_samples(A[c], local, shape[n], *seen_by, iterations > 0, stride, *filled)
             if counts[c] == 0:
                 continue
             seen += 1

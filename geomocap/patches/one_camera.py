@@ -67,8 +67,8 @@ def image_precision(patches: Patches, which: np.ndarray, camera: np.ndarray, cor
     which, camera : (A,) int
     correlation : (A,) float
     """
-    template = patches.templates[patches.rows[which], camera, -1].astype(np.float64)
-    usable = patches.usable[patches.rows[which], camera][:, :, None] != 0
+    template = patches.store.templates[patches.rows[which], camera, -1].astype(np.float64)
+    usable = patches.store.usable[patches.rows[which], camera][:, :, None] != 0
     count = np.maximum(usable.sum(axis=1), 1)
     free = np.where(usable, template - (template * usable).sum(axis=1, keepdims=True) / count[:, None], 0.0)
     slopes = free[:, :, 1:]

@@ -62,56 +62,6 @@ def turn_by(Q, w0, w1, w2, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _take_template(n, X, Q, shape, rows, want, levels, masks, P, templates, usable):
-    """Take the templates of patch n; parameters as of `take_templates`."""
-    C = want.shape[1]
-    L = levels.shape[0]
-    H, W = masks.shape[1:]
-    M = shape.shape[1]
-    A = np.empty((3, 4))
-    row = rows[n]
-    for c in range(C):
-        if not want[n, c]:
-            continue
-        local_camera(P[c], X[n], Q[n], A)
-        count, offered, total, square = 0, 0, 0.0, 0.0
-        for q in range(M):
-            usable[row, c, q] = 0
-            if np.isnan(shape[n, q, 0]):
-                continue
-            offered += 1
-            s, t, z, zs, zt = shape[n, q, 0], shape[n, q, 1], shape[n, q, 2], shape[n, q, 3], shape[n, q, 4]
-            w = A[2, 0] * s + A[2, 1] * t + A[2, 2] * z + A[2, 3]
-            if w <= 0:
-                continue
-            x = (A[0, 0] * s + A[0, 1] * t + A[0, 2] * z + A[0, 3]) / w
-            y = (A[1, 0] * s + A[1, 1] * t + A[1, 2] * z + A[1, 3]) / w
-            if not (x >= 1 and y >= 1 and x < W - 2 and y < H - 2):
-                continue
-            if masks[c, int(y + 0.5), int(x + 0.5)] == 0:
-                continue
-            usable[row, c, q] = 1
-            count += 1
-            # derivatives of the pixel by s, t, z
-            xs, ys = (A[0, 0] - x * A[2, 0]) / w, (A[1, 0] - y * A[2, 0]) / w
-            xt, yt = (A[0, 1] - x * A[2, 1]) / w, (A[1, 1] - y * A[2, 1]) / w
-            xz, yz = (A[0, 2] - x * A[2, 2]) / w, (A[1, 2] - y * A[2, 2]) / w
-            for level in range(L):
-                image = levels[level, c]
-                value = bilinear(image, x, y)
-                gx = bilinear(image, x + 0.5, y) - bilinear(image, x - 0.5, y)
-                gy = bilinear(image, x, y + 0.5) - bilinear(image, x, y - 0.5)
-                templates[row, c, level, q, 0] = value
-                templates[row, c, level, q, 1] = gx * (xs + zs * xz) + gy * (ys + zs * yz)
-                templates[row, c, level, q, 2] = gx * (xt + zt * xz) + gy * (yt + zt * yz)
-            value = templates[row, c, L - 1, q, 0]
-            total += value
-            square += value * value
-        if count < max(LEAST_SAMPLES * offered, 1) or square / count - (total / count) ** 2 < LEAST_VARIANCE:
-            want[n, c] = 0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def take_templates(begin, end, X, Q, shape, rows, want, levels, masks, P, templates, usable):
     """Take templates of patches in the cameras where `want` is 1.
 
@@ -133,5 +83,49 @@ def take_templates(begin, end, X, Q, shape, rows, want, levels, masks, P, templa
     usable : (R, C, M) uint8
         Filled with 1 where the sample was seen.
     """
+    C = want.shape[1]
+    L = levels.shape[0]
+    H, W = masks.shape[1:]
+    M = shape.shape[1]
+    A = np.empty((3, 4))
     for n in range(begin, end):
-        _take_template(n, X, Q, shape, rows, want, levels, masks, P, templates, usable)
+        row = rows[n]
+        for c in range(C):
+            if not want[n, c]:
+                continue
+            local_camera(P[c], X[n], Q[n], A)
+            count, offered, total, square = 0, 0, 0.0, 0.0
+            for q in range(M):
+                usable[row, c, q] = 0
+                if np.isnan(shape[n, q, 0]):
+                    continue
+                offered += 1
+                s, t, z, zs, zt = shape[n, q, 0], shape[n, q, 1], shape[n, q, 2], shape[n, q, 3], shape[n, q, 4]
+                w = A[2, 0] * s + A[2, 1] * t + A[2, 2] * z + A[2, 3]
+                if w <= 0:
+                    continue
+                x = (A[0, 0] * s + A[0, 1] * t + A[0, 2] * z + A[0, 3]) / w
+                y = (A[1, 0] * s + A[1, 1] * t + A[1, 2] * z + A[1, 3]) / w
+                if not (x >= 1 and y >= 1 and x < W - 2 and y < H - 2):
+                    continue
+                if masks[c, int(y + 0.5), int(x + 0.5)] == 0:
+                    continue
+                usable[row, c, q] = 1
+                count += 1
+                # derivatives of the pixel by s, t, z
+                xs, ys = (A[0, 0] - x * A[2, 0]) / w, (A[1, 0] - y * A[2, 0]) / w
+                xt, yt = (A[0, 1] - x * A[2, 1]) / w, (A[1, 1] - y * A[2, 1]) / w
+                xz, yz = (A[0, 2] - x * A[2, 2]) / w, (A[1, 2] - y * A[2, 2]) / w
+                for level in range(L):
+                    image = levels[level, c]
+                    value = bilinear(image, x, y)
+                    gx = bilinear(image, x + 0.5, y) - bilinear(image, x - 0.5, y)
+                    gy = bilinear(image, x, y + 0.5) - bilinear(image, x, y - 0.5)
+                    templates[row, c, level, q, 0] = value
+                    templates[row, c, level, q, 1] = gx * (xs + zs * xz) + gy * (ys + zs * yz)
+                    templates[row, c, level, q, 2] = gx * (xt + zt * xz) + gy * (yt + zt * yz)
+                value = templates[row, c, L - 1, q, 0]
+                total += value
+                square += value * value
+            if count < max(LEAST_SAMPLES * offered, 1) or square / count - (total / count) ** 2 < LEAST_VARIANCE:
+                want[n, c] = 0

@@ -18,7 +18,7 @@ from geomocap.patches.patch_search import Followed, carry_lost, hiding_depth, ju
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.patches.reacquisition import reacquire
 from geomocap.patches.seeding import patch_radii, seed_for_one_camera, seed_patches, seed_spacing
-from geomocap.patches.surface_patches import PatchAlignment, Patches, doubted, with_templates
+from geomocap.patches.surface_patches import SAME_SIDE, PatchAlignment, Patches, TemplateStore, doubted, with_templates
 from geomocap.patches.swings import find_pieces, lost_pieces
 from geomocap.patches.track_record import TrackRecord
 from geomocap.progress import Progress, silent
@@ -29,7 +29,6 @@ from geomocap.trajectories.neighbour_precision import clear_unsure, with_observe
 _SMOOTH = 0.7  # fraction of the newest motion in the velocity
 _DOUBLE = 0.5  # of the spacing: patches nearer than that follow the same surface
 _LONG_BESIDE = 4  # frames after which the younger one is given up
-_SAME_SIDE = 0.5  # cosine between normals
 _LOOK_EVERY = 3  # frames between looks for lost patches in all cameras
 _UNSURE = 2.0  # times the standard deviation allowed in a frame that one may have since a patch was placed
 _SURE = 0.9  # correlation from which such a patch is found,
@@ -141,20 +140,10 @@ def _taken(state: Followed | None) -> tuple[np.ndarray, np.ndarray]:
 def _bare(seeds: Followed) -> Followed:
     """Leave out the templates, which are taken again from the same frame: only who has one is kept."""
     patches = seeds.patches
-    N, (C, L) = len(patches), patches.templates.shape[1:3]
-    blank = Patches(
-        patches.positions,
-        patches.frames,
-        patches.shape,
-        patches.size,
-        np.arange(N),
-        np.zeros((N, C, L, 0, 3), np.float32),
-        np.zeros((N, C, 0), np.uint8),
-        patches.has,
-        patches.hidden,
-        patches.doubt,
-    )
-    return Followed.begin(blank, seeds.identity, seeds.by_one)
+    cameras, levels = patches.store.templates.shape[1:3]
+    blank = TemplateStore.blank(len(patches), cameras, levels, 0)
+    bare = replace(patches, rows=np.arange(len(patches)), store=blank)
+    return Followed.begin(bare, seeds.identity, seeds.by_one)
 
 
 def _dressed(seeds: Followed, view: FrameViews) -> Followed:
@@ -264,5 +253,5 @@ def _beside_older(identity: np.ndarray, positions: np.ndarray, normals: np.ndarr
     if len(identity) < 2:
         return np.zeros(0, int)
     first, second = cKDTree(positions).query_pairs(distance, output_type="ndarray").T
-    same = np.einsum("ni,ni->n", normals[first], normals[second]) > _SAME_SIDE
+    same = np.einsum("ni,ni->n", normals[first], normals[second]) > SAME_SIDE
     return np.unique(np.maximum(identity[first[same]], identity[second[same]]))

@@ -19,6 +19,8 @@ from geomocap.model.rotations import rigid_motion
 from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.seeding import patch_shape, spread, surface_frames
 from geomocap.patches.surface_patches import (
+    FACING_OTHERS,
+    SAME_SIDE,
     PatchAlignment,
     Patches,
     align,
@@ -31,7 +33,6 @@ from geomocap.patches.surface_patches import (
 _FREE = 1.5  # spacings from the nearest patch
 _DENSE = 0.7  # distance of the places looked at, spacings,
 _MOST_PLACES = 10_000  # if there are not more than about so many
-_FACING = 0.35
 _HULL_VOXELS = 2.0  # a place may lie so far behind the drawn surface
 _MATCHED, _TRIED = 128, 32  # patches of a piece whose textures are looked for; that stand for it
 _PART = 0.6  # fraction of them that must fit: the piece may have been two
@@ -41,7 +42,6 @@ _MATCHES, _MATCHES_OF_ANGLE = 100_000, 20_000  # and most pairs of them
 _INSIDE = 0.6  # fraction of the patches that must lie in the silhouettes
 _BESIDE = 1.5  # spacings; a patch is compared with places so near to it
 _CELL = 0.5  # edge of the cells in which these are looked up, spacings
-_SAME_SIDE = 0.5  # cosine between normals
 _LOOKED_AT = 4000  # motions for which all patches are looked at
 _LIKELY, _BEST_OF = 300, 6  # motions that are drawn to the best of so many places
 _COMPARED, _ALIGNED = 100, 12  # motions that are compared with the images, and aligned
@@ -68,7 +68,7 @@ def free_places(taken: np.ndarray, patches: Patches, view: FrameViews, spacing: 
     free = view.surface
     if len(taken):
         free = free[cKDTree(taken).query(free)[0] > _FREE * spacing]
-    C, (L, M) = view.count, patches.templates.shape[2:4]
+    C, (L, M) = view.count, patches.store.templates.shape[2:4]
     if not len(free):
         return Patches.empty(M, C, L)
     distance = max(_DENSE * spacing, view.voxel_size * float(np.sqrt(len(free) / _MOST_PLACES)))
@@ -77,7 +77,7 @@ def free_places(taken: np.ndarray, patches: Patches, view: FrameViews, spacing: 
     size = np.full(len(positions), np.median(patches.size))
     blank = Patches.without_templates(positions, frames, patch_shape(curvature, size, _radius(M)), size, C, L)
     slack = np.full((len(points), 1), _HULL_VOXELS * view.voxel_size)
-    seen = visible(positions, frames, blank.hidden, view, slack, _FACING)
+    seen = visible(positions, frames, blank.hidden, view, slack, FACING_OTHERS)
     best = np.where(seen, facings(positions, blank.normals, view), -2).argmax(axis=1)
     covered = with_templates(blank, seen & (np.arange(C) == best[:, None]), view)
     return covered.select(np.flatnonzero(covered.has.any(axis=1)))
@@ -147,7 +147,7 @@ def _compare(
     many = piece.select(rows)
     X = (piece.positions @ turns.swapaxes(1, 2) + shifts[:, None]).reshape(-1, 3)
     Q = (turns[:, None] @ piece.frames).reshape(-1, 3, 3)
-    use = visible(X, Q, many.hidden, view, slack[rows], _FACING)
+    use = visible(X, Q, many.hidden, view, slack[rows], FACING_OTHERS)
     at: PatchAlignment = align(
         many,
         np.flatnonzero(use.any(axis=1)),
@@ -268,7 +268,7 @@ def together(turns, shifts, X, Q, who, frames, alike, low, edge, cells, value):
                     )
             F = frames[place]
             normal = F[0, 2] * turned[0, 2] + F[1, 2] * turned[1, 2] + F[2, 2] * turned[2, 2]
-            if normal < _SAME_SIDE:
+            if normal < SAME_SIDE:
                 continue
             ss = F[0, 0] * turned[0, 0] + F[1, 0] * turned[1, 0] + F[2, 0] * turned[2, 0]
             st = F[0, 0] * turned[0, 1] + F[1, 0] * turned[1, 1] + F[2, 0] * turned[2, 1]
@@ -311,8 +311,8 @@ def _beside(
 def _textures(patches: Patches) -> np.ndarray:
     """Blurred textures (N, M) of patches as the first camera with a template saw them; its mean where it saw none."""
     camera = patches.has.argmax(axis=1)
-    texture = patches.templates[patches.rows, camera, 0, :, 0].astype(float)
-    usable = patches.usable[patches.rows, camera] != 0
+    texture = patches.store.templates[patches.rows, camera, 0, :, 0].astype(float)
+    usable = patches.store.usable[patches.rows, camera] != 0
     middle = (texture * usable).sum(axis=1) / np.maximum(usable.sum(axis=1), 1)
     return np.where(usable, texture, middle[:, None])
 

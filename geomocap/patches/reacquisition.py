@@ -8,9 +8,8 @@ import numpy as np
 
 from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.patch_settings import TrackingSettings
-from geomocap.patches.surface_patches import PatchAlignment, Patches, align, one_template, visible
+from geomocap.patches.surface_patches import FACING_OTHERS, PatchAlignment, Patches, align, one_template, visible
 
-_FACING = 0.35
 _FAR_PX = 7.0  # how far from where its companions have it a patch may be found
 
 
@@ -47,7 +46,7 @@ def reacquire(
     agree : (N, C) bool
         Cameras in which it was found.
     """
-    use = visible(patches.positions, patches.frames, patches.hidden, view, slack, _FACING)
+    use = visible(patches.positions, patches.frames, patches.hidden, view, slack, FACING_OTHERS)
     which = np.flatnonzero(lost & (use.sum(axis=1) >= settings.n_views) & patches.has.any(axis=1))
     some, seen = patches.select(which), use[which]
     rows, C = np.arange(len(which)), view.count

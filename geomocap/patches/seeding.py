@@ -9,10 +9,9 @@ from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.ghosts import nothing_behind
 from geomocap.patches.one_camera import image_precision
 from geomocap.patches.patch_settings import TrackingSettings
-from geomocap.patches.surface_patches import Patches, align, facings, with_templates
+from geomocap.patches.surface_patches import FACING_OTHERS, Patches, align, as_one_camera, facings, with_templates
 
 _FIT_VOXELS = 4.5  # radius of the piece of surface that gives a patch its shape, voxels
-_FACING = 0.35
 _FACING_ALONE = 0.5  # of a camera that sees a patch alone
 _HULL_SLACK = 3.0  # voxels that a seed may lie behind the drawn surface
 _REGULAR = 1e-12
@@ -197,7 +196,7 @@ def seed_for_one_camera(
 
 def _seed_at(points: np.ndarray, view: FrameViews, settings: TrackingSettings, radius_px: int) -> Patches:
     """Make patches at points of the surface (N, 3), as far as two cameras agree on them."""
-    blank, seen, cosine = _blank(points, view, settings, settings.n_views, _FACING, radius_px)
+    blank, seen, cosine = _blank(points, view, settings, settings.n_views, FACING_OTHERS, radius_px)
     # a patch belongs to the camera that faces it best; it needs a second one
     patches, reference = _of_best_camera(blank, seen, cosine, view)
     keep = np.flatnonzero(patches.has.any(axis=1))
@@ -237,18 +236,7 @@ def _lock(
     N, C = seen.shape
     rows, every = np.arange(N), np.arange(N)
     # all cameras look for what the reference camera saw
-    shared = Patches(
-        patches.positions,
-        patches.frames,
-        patches.shape,
-        patches.size,
-        rows,
-        np.ascontiguousarray(np.repeat(patches.templates[patches.rows, reference][:, None], C, axis=1)),
-        np.ascontiguousarray(np.repeat(patches.usable[patches.rows, reference][:, None], C, axis=1)),
-        seen,
-        patches.hidden,
-        patches.doubt,
-    )
+    shared = as_one_camera(patches, reference, seen)
     others = seen.copy()
     others[rows, reference] = False
     ray = patches.positions - view.centers[reference]

@@ -14,6 +14,8 @@ from geomocap.scheduling import spread
 _FEW = 32  # patches that are not worth waking other threads for
 _COARSE_STRIDE = 2  # of the samples, on blurred levels
 _OWN = ("positions", "frames", "shape", "size", "rows", "has", "hidden", "doubt")
+FACING_OTHERS = 0.35  # cosine from which a camera looks for what another one has seen
+SAME_SIDE = 0.5  # cosine between normals of patches on the same side of a limb
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,49 @@ class PatchAlignment:
         return rest
 
 
+@dataclass
+class TemplateStore:
+    """What cameras have seen of R patches. It changes in place, as copies of it would cost more than following patches.
+
+    Patches share the store of those they were selected from, and know their rows in it. `with_templates` fills it where
+    the patches that it is given have no template; those who gave one up (`renewed`) are not used any more.
+
+    Attributes
+    ----------
+    templates : (R, C, L, M, 3) float32
+        Grey level and its slopes along s and t, for each camera and blur level.
+    usable : (R, C, M) uint8
+        Samples that the template has.
+    """
+
+    templates: np.ndarray
+    usable: np.ndarray
+
+    @classmethod
+    def blank(cls, rows: int, cameras: int, levels: int, samples: int) -> TemplateStore:
+        """Return a store without templates."""
+        templates = np.zeros((rows, cameras, levels, samples, 3), np.float32)
+        return cls(templates, np.zeros((rows, cameras, samples), np.uint8))
+
+    def join(self, rows: np.ndarray, other: TemplateStore, other_rows: np.ndarray) -> TemplateStore:
+        """Return some rows of this store followed by some of another, copied."""
+        parts, count = [], len(rows)
+        for mine, new in ((self.templates, other.templates), (self.usable, other.usable)):
+            both = np.empty((count + len(other_rows), *mine.shape[1:]), mine.dtype)
+            np.take(mine, rows, axis=0, out=both[:count], mode="clip")  # "raise" would copy once more
+            np.take(new, other_rows, axis=0, out=both[count:], mode="clip")
+            parts.append(both)
+        return TemplateStore(*parts)
+
+    def of_one_camera(self, rows: np.ndarray, camera: np.ndarray) -> TemplateStore:
+        """Return rows (N,) copied, in which all cameras have the template of one, (N,) int."""
+        count = self.templates.shape[1]
+        arrays = (self.templates, self.usable)
+        return TemplateStore(
+            *(np.ascontiguousarray(np.repeat(a[rows, camera][:, None], count, axis=1)) for a in arrays)
+        )
+
+
 @dataclass(frozen=True)
 class Patches:
     """N patches with M samples each, ready to be looked for by C cameras.
@@ -90,11 +135,9 @@ class Patches:
     size : (N,) float
         Spacing of the samples: about a pixel, metres.
     rows : (N,) int
-        Where each has its templates in the next two arrays, which patches share with those they were selected from.
-    templates : (R, C, L, M, 3) float32
-        Grey level and its slopes along s and t, for each camera and blur level.
-    usable : (R, C, M) uint8
-        Samples that the template has.
+        Where each has its templates in the store.
+    store : TemplateStore
+        Shared with patches that these were selected from.
     has : (N, C) bool
         Cameras with a template.
     hidden : (N, C) float
@@ -108,8 +151,7 @@ class Patches:
     shape: np.ndarray
     size: np.ndarray
     rows: np.ndarray
-    templates: np.ndarray
-    usable: np.ndarray
+    store: TemplateStore
     has: np.ndarray
     hidden: np.ndarray
     doubt: np.ndarray
@@ -135,8 +177,7 @@ class Patches:
             shape,
             size,
             np.arange(N),
-            np.zeros((N, C, L, M, 3), np.float32),
-            np.zeros((N, C, M), np.uint8),
+            TemplateStore.blank(N, C, L, M),
             np.zeros((N, C), bool),
             np.full((N, C), np.nan),
             np.zeros((N, C)),
@@ -150,12 +191,7 @@ class Patches:
         """Return these followed by others, without the templates of any that were left out."""
         parts = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _OWN}
         parts["rows"] = np.arange(len(self) + len(other))
-        for name in ("templates", "usable"):
-            mine, new = getattr(self, name), getattr(other, name)
-            parts[name] = both = np.empty((len(self) + len(other), *mine.shape[1:]), mine.dtype)
-            np.take(mine, self.rows, axis=0, out=both[: len(self)], mode="clip")  # "raise" would copy once more
-            np.take(new, other.rows, axis=0, out=both[len(self) :], mode="clip")
-        return Patches(**parts)
+        return Patches(**parts, store=self.store.join(self.rows, other.store, other.rows))
 
     def moved(self, positions: np.ndarray, frames: np.ndarray) -> Patches:
         """Return them at other places."""
@@ -200,7 +236,7 @@ def facings(positions: np.ndarray, normals: np.ndarray, view: FrameViews) -> np.
 def with_templates(patches: Patches, want: np.ndarray, view: FrameViews, sigma: np.ndarray | None = None) -> Patches:
     """Take templates in the cameras `want` (N, C) bool that have none; where too little is seen there is none.
 
-    The new patches share the large arrays of templates with those given, which have nothing in the places filled.
+    The new patches share their store with those given, see `TemplateStore`.
     `sigma` (N,): standard deviation of their places, metres; 0 if not given, as where patches begin.
     """
     took = np.ascontiguousarray(want & ~patches.has, np.uint8)
@@ -215,8 +251,8 @@ def with_templates(patches: Patches, want: np.ndarray, view: FrameViews, sigma: 
         view.levels,
         view.masks,
         view.projections,
-        patches.templates,
-        patches.usable,
+        patches.store.templates,
+        patches.store.usable,
     )
     got = took != 0
     depth, surface = view.depths(patches.positions)
@@ -228,12 +264,15 @@ def with_templates(patches: Patches, want: np.ndarray, view: FrameViews, sigma: 
 def one_template(patches: Patches, view: FrameViews) -> tuple[Patches, np.ndarray]:
     """Give all cameras the template of the camera (N,) that faces each patch best, of those that have one."""
     best = np.where(patches.has, facings(patches.positions, patches.normals, view), -2).argmax(axis=1)
-    shared = {
-        name: np.ascontiguousarray(np.repeat(getattr(patches, name)[patches.rows, best][:, None], view.count, axis=1))
-        for name in ("templates", "usable")
-    }
-    sure = np.zeros_like(patches.doubt)  # it is the same for all cameras
-    return replace(patches, rows=np.arange(len(patches)), has=np.ones_like(patches.has), doubt=sure, **shared), best
+    shared = as_one_camera(patches, best, np.ones_like(patches.has))
+    return replace(shared, doubt=np.zeros_like(patches.doubt)), best  # it is the same for all cameras
+
+
+def as_one_camera(patches: Patches, camera: np.ndarray, has: np.ndarray) -> Patches:
+    """Let the cameras `has` (N, C) look for what one camera, (N,) int, has seen of each patch."""
+    return replace(
+        patches, rows=np.arange(len(patches)), store=patches.store.of_one_camera(patches.rows, camera), has=has
+    )
 
 
 def doubted(patches: Patches, found: PatchAlignment) -> PatchAlignment:
@@ -297,24 +336,13 @@ def align(
             which,
             X,
             Q,
-            patches.shape,
-            patches.size,
-            patches.rows,
-            patches.templates,
-            patches.usable,
-            patches.doubt,
+            (patches.shape, patches.size, patches.rows, patches.store.templates, patches.store.usable, patches.doubt),
             np.ascontiguousarray(use, np.uint8),
-            view.levels[level],
+            (view.levels[level], view.masks, view.projections, view.centers),
             level,
             1 if level == len(view.levels) - 1 else _COARSE_STRIDE,
-            view.masks,
             level == len(view.levels) - 1,
-            view.projections,
-            view.centers,
-            expected[0],
-            expected[1],
-            prior_shift_px * patches.size,
-            np.full(N, prior_turn),
+            (*expected, prior_shift_px * patches.size, np.full(N, prior_turn)),
             count,
             least_correlation,
             correlation,

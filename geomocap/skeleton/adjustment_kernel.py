@@ -42,29 +42,12 @@ def _add_block(block: np.ndarray, x: np.ndarray, y: np.ndarray, weight: np.ndarr
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _frame_equations(
-    t,
-    rotations,
-    translations,
-    twists,
-    chain,
-    chain_start,
-    points,
-    bodies,
-    fractions,
-    start,
-    point,
-    target,
-    normal,
-    isotropic,
-    across,
-    cutoff,
-    matrices,
-    rights,
-    costs,
-):
-    """Fill the matrix, right side and cost of frame t; parameters as of `normal_equations`."""
-    matrix, right = matrices[t], rights[t]
+def _frame_equations(t, motion, chains, skin, observations, cutoff, matrix, right):
+    """Add to the matrix and right side of frame t, and return its cost; parameters as of `normal_equations`."""
+    rotations, translations, twists = motion
+    chain, chain_start = chains
+    points, bodies, fractions = skin
+    start, point, target, normal, isotropic, across = observations
     count = rotations.shape[1]
     unknowns = twists.shape[1]
     most = bodies.shape[1]
@@ -135,54 +118,26 @@ def _frame_equations(
                     for i in range(6):
                         value += carried[u, i] * twists[t, w, i]
                     matrix[u, w] += value
-    costs[t] = cost
+    return cost
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def normal_equations(
-    begin,
-    end,
-    rotations: np.ndarray,
-    translations: np.ndarray,
-    twists: np.ndarray,
-    chain: np.ndarray,
-    chain_start: np.ndarray,
-    points: np.ndarray,
-    bodies: np.ndarray,
-    fractions: np.ndarray,
-    start: np.ndarray,
-    point: np.ndarray,
-    target: np.ndarray,
-    normal: np.ndarray,
-    isotropic: np.ndarray,
-    across: np.ndarray,
-    cutoff: float,
-    matrix: np.ndarray,
-    right: np.ndarray,
-    cost: np.ndarray,
-) -> None:
+def normal_equations(begin, end, motion, chains, skin, observations, cutoff, matrix, right, cost):
     """Gauss–Newton normal equations of each frame, observations weighted by 1 / (1 + χ² / cutoff²) (Cauchy).
 
     Parameters
     ----------
-    rotations, translations : (T, B, 3, 3), (T, B, 3) float
-        Motion of the bodies.
-    twists : (T, K, 6) float
-        Turn and shift about the world's origin that a unit of each unknown gives to all bodies that it moves.
-    chain, chain_start : (…,) int, (B + 1,) int
+    begin, end : int
+        The frames of the part, of T.
+    motion : rotations (T, B, 3, 3), translations (T, B, 3), twists (T, K, 6)
+        Motion of the bodies; turn and shift about the world's origin that a unit of each unknown gives to all bodies
+        that it moves.
+    chains : chain (…,) int, chain_start (B + 1,) int
         Unknowns that move body b: chain[chain_start[b] : chain_start[b + 1]], ascending.
-    points : (N, 3) float, metres
-        At rest.
-    bodies, fractions : (N, C) int, (N, C) float
-        The bodies that a point follows.
-    start : (T + 1,) int
-        Observations of frame t are those from start[t] to start[t + 1].
-    point : (M,) int
-        Point that an observation is of.
-    target, normal : (M, 3) float
-        Where it was seen, metres, and a unit direction.
-    isotropic, across : (M,) float, 1 / metres²
-        Weight of the distance from the target, and of that along the normal.
+    skin : points (N, 3), bodies (N, C) int, fractions (N, C)
+        `SkinPoints`: at rest, metres; the bodies that a point follows.
+    observations : start (T + 1,) int, point (M,) int, target (M, 3), normal (M, 3), isotropic (M,), across (M,)
+        `Observations`: where points were seen, metres, and weights of the distance from there.
     cutoff : float
         In standard deviations.
     matrix, right : (T, K, K), (T, K) float
@@ -191,24 +146,4 @@ def normal_equations(
         Filled: half the sum of cutoff² log(1 + χ² / cutoff²).
     """
     for t in range(begin, end):
-        _frame_equations(
-            t,
-            rotations,
-            translations,
-            twists,
-            chain,
-            chain_start,
-            points,
-            bodies,
-            fractions,
-            start,
-            point,
-            target,
-            normal,
-            isotropic,
-            across,
-            cutoff,
-            matrix,
-            right,
-            cost,
-        )
+        cost[t] = _frame_equations(t, motion, chains, skin, observations, cutoff, matrix[t], right[t])

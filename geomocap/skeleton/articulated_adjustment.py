@@ -196,7 +196,7 @@ def _system(
     turns = int(linkage.joint_dof[-1])
     size = turns + (3 * len(linkage.joints) if looseness is not None else 0)
     shared = 3 * len(linkage.joints) if joint_prior is not None else 0
-    chain, chain_start = _unknowns_of_bodies(linkage, looseness is not None, joint_prior is not None)
+    chains = _unknowns_of_bodies(linkage, looseness is not None, joint_prior is not None)
     frames = motion.frames
     blocks, right = np.empty((frames, size, size)), np.empty((frames, size))
     border = np.empty((frames, size, shared))
@@ -210,20 +210,10 @@ def _system(
         spread(
             normal_equations,
             count,
-            part.rotations,
-            part.translations,
-            _twists(linkage, motion.part(some), part, joint_prior is not None),
-            chain,
-            chain_start,
-            points.rest,
-            points.bodies,
-            points.fractions,
-            observations.start[some.start : some.stop + 1],
-            observations.point,
-            observations.target,
-            observations.normal,
-            observations.isotropic,
-            observations.across,
+            (part.rotations, part.translations, _twists(linkage, motion.part(some), part, joint_prior is not None)),
+            chains,
+            points.arrays,
+            observations.arrays(some),
             cutoff,
             matrix,
             sides,

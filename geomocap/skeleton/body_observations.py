@@ -45,6 +45,11 @@ class SkinPoints:
     def __len__(self) -> int:
         return len(self.rest)
 
+    @property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What kernels take."""
+        return self.rest, self.bodies, self.fractions
+
     def weights(self, count: int) -> np.ndarray:
         """Skin weights (N, count) of all bodies."""
         result = np.zeros((len(self), count))
@@ -92,6 +97,11 @@ class Observations:
     def frame(self) -> np.ndarray:
         """Frame of each observation, (M,) int."""
         return np.repeat(np.arange(self.frames), np.diff(self.start))
+
+    def arrays(self, frames: slice) -> tuple[np.ndarray, ...]:
+        """Return what kernels take, for some frames: all observations, and where those of each frame begin."""
+        start = self.start[frames.start : frames.stop + 1]
+        return start, self.point, self.target, self.normal, self.isotropic, self.across
 
     @classmethod
     def of_paths(

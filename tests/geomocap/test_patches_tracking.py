@@ -108,7 +108,7 @@ def test_seeds_lie_on_the_surface_with_two_cameras_each(scene, seeds):
 def test_templates_have_the_slopes_of_the_surface(scene, views, seeds):
     """The stored slopes are what grey levels change by along the patch."""
     n, c = 0, int(np.flatnonzero(seeds.has[0])[0])
-    template = seeds.templates[n, c, 0].reshape(9, 9, 3)
+    template = seeds.store.templates[n, c, 0].reshape(9, 9, 3)
     step = seeds.size[n]
     along = (template[1:-1, 2:, 0] - template[1:-1, :-2, 0]) / (2 * step)
     assert np.corrcoef(along.ravel(), template[1:-1, 1:-1, 1].ravel())[0, 1] > 0.98
@@ -148,7 +148,7 @@ def reference_step(patches, n, X, Q, view, level, size):
     """One Gauss–Newton step by numerical differentiation of the images themselves, offset and gain as unknowns."""
 
     def sample(x, q, c):
-        p = patches.shape[n, patches.usable[n, c] > 0, :3] @ q.T + x
+        p = patches.shape[n, patches.store.usable[n, c] > 0, :3] @ q.T + x
         h = np.c_[p, np.ones(len(p))] @ view.projections[c].T
         u, v = h[:, 0] / h[:, 2], h[:, 1] / h[:, 2]
         i, j = u.astype(int), v.astype(int)
@@ -160,7 +160,7 @@ def reference_step(patches, n, X, Q, view, level, size):
 
     N, b = np.zeros((6, 6)), np.zeros(6)
     for c in np.flatnonzero(patches.has[n]):
-        T = patches.templates[n, c, level, patches.usable[n, c] > 0, 0].astype(float)
+        T = patches.store.templates[n, c, level, patches.store.usable[n, c] > 0, 0].astype(float)
         grey = sample(X, Q, c)
         J = np.empty((len(T), 6))
         for r in range(6):
@@ -253,10 +253,10 @@ def test_templates_are_taken_again_as_asked(scene, views, seeds, templates, frac
     found = align(seeds, every, X, Q, seeds.has, views[1], iterations=(4, 8), least_correlation=0.6)
     fit = np.where(every[:, None] % 2, 0.8, 0.99)
     found = replace(found, by_camera=np.where(found.by_camera > -1, fit, -1.0))
-    copy = replace(seeds, templates=seeds.templates.copy(), usable=seeds.usable.copy())
+    copy = seeds.join(seeds.select(every[:0]))
     good = every % 5 > 0
     again = renewed(copy.moved(X, Q), found, good, views[1], templates)
-    changed = (again.templates != seeds.templates).any(axis=(2, 3, 4)) & seeds.has
+    changed = (again.store.templates != seeds.store.templates).any(axis=(2, 3, 4)) & seeds.has
     taken = changed.any(axis=1)
     assert not taken[~good].any()
     if templates == "updated":
@@ -285,7 +285,7 @@ def test_cameras_whose_templates_are_in_doubt_move_a_patch_less(scene, views, se
     rows = np.flatnonzero(seeds.has.sum(axis=1) == 2)
     beside = 0.002 * Q[:, :, 0]
     astray = seeds.has & (np.arange(seeds.has.shape[1]) == seeds.has.argmax(axis=1)[:, None])
-    copy = replace(seeds, templates=seeds.templates.copy(), usable=seeds.usable.copy())
+    copy = seeds.join(seeds.select(rows[:0]))
     away = {}
     for doubt in (0.0, 0.01):
         later = with_templates(

@@ -81,28 +81,10 @@ def test_kernel_agrees_with_the_sums_written_out():
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     isotropic, across = rng.random((2, seen))
     matrix, right, cost = np.zeros((frames, unknowns, unknowns)), np.zeros((frames, unknowns)), np.empty(frames)
-    normal_equations(
-        0,
-        frames,
-        rotations,
-        translations,
-        twists,
-        np.concatenate(chains),
-        np.concatenate([[0], np.cumsum([len(c) for c in chains])]),
-        skin.rest,
-        skin.bodies,
-        skin.fractions,
-        start,
-        point,
-        target,
-        normal,
-        isotropic,
-        across,
-        cutoff,
-        matrix,
-        right,
-        cost,
-    )
+    unknowns_of = np.concatenate(chains), np.concatenate([[0], np.cumsum([len(c) for c in chains])])
+    observed = start, point, target, normal, isotropic, across
+    motion = rotations, translations, twists
+    normal_equations(0, frames, motion, unknowns_of, skin.arrays, observed, cutoff, matrix, right, cost)
     for t in range(frames):
         expected, side, total = np.zeros((unknowns, unknowns)), np.zeros(unknowns), 0.0
         for m in range(start[t], start[t + 1]):
