@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -43,3 +44,18 @@ Workers = Annotated[
 Scheduler = Annotated[
     str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler to map frames on, tcp://host:8786.")
 ]
+Host = Annotated[
+    str, typer.Option("--host", help="Address that the page listens on; others than this one let others in.")
+]
+Port = Annotated[
+    int, typer.Option("--port", min=1, max=65535, help="Port of the page; the next free one if it is taken.")
+]
+
+
+@dataclass(frozen=True)
+class Where:
+    """Where a command's work runs; `with_settings` makes options of it."""
+
+    workers: Workers = None
+    scheduler: Scheduler = None
+    wait: Wait = False

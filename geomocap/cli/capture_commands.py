@@ -16,7 +16,7 @@ from data_tools.importing_calibrations import Format, convert_calibration, impor
 from data_tools.synthesize import SynthesisSettings
 from data_tools.synthesize import synthesize as synthesize_capture
 from geomocap import pipeline
-from geomocap.cli.arguments import CaptureFolder, MetresPerUnit, Workers
+from geomocap.cli.arguments import CaptureFolder, MetresPerUnit, Where, Workers
 from geomocap.cli.console import console
 from geomocap.cli.execution import executor_for
 from geomocap.cli.jobs import capture_job
@@ -131,7 +131,7 @@ def demo(
     with executor_for(workers, None) as executor, progress_bars() as progress:
         if not (capture / "capture.toml").exists():
             synthesize_capture(figure(), capture, truth, DEMO, executor=executor, progress=progress)
-    with capture_job(capture, run, Config(), workers, None) as job:
+    with capture_job(capture, run, Config(), Where(workers)) as job:
         key = pipeline.motion_files(job, "voxels")
         review_job(job, key)
     tell_results(run)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from concurrent.futures import Executor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from geomocap.cli.arguments import Where
 from geomocap.cli.execution import executor_for
 from geomocap.cli.progress_bars import progress_bars
 from geomocap.cli.reports import agreeing_job, tell_note, working
@@ -17,6 +19,7 @@ from geomocap.files.preview import PreviewCapture
 from geomocap.files.run import Run
 from geomocap.files.scans import open_scans
 from geomocap.pipeline.job import Job
+from geomocap.progress import Progress
 from geomocap.subject.subject_model import MODEL_FILE, read_model
 
 CAPTURE_FOLDERS = ("images", "videos", "background", "masks", "sparse", "bar")  # of a capture
@@ -24,15 +27,7 @@ CAPTURE_FOLDERS = ("images", "videos", "background", "masks", "sparse", "bar")  
 
 @contextmanager
 def capture_job(
-    capture: Path,
-    run: Path,
-    config: Config,
-    workers: int | None,
-    scheduler: str | None,
-    model: Path | None = None,
-    *,
-    wait: bool = False,
-    preview: bool = False,
+    capture: Path, run: Path, config: Config, where: Where, model: Path | None = None, *, preview: bool = False
 ) -> Iterator[Job]:
     """Make the job of a capture or of its preview, with the subject's model if there is one."""
     opened = Capture.open(capture)
@@ -46,29 +41,28 @@ def capture_job(
     with suppress(GeomocapError):  # what is wrong with the cameras, the stages that need them say
         for note in opened.rig.notes:
             tell_note(note)
-    with working(run, wait), executor_for(workers, scheduler) as executor, progress_bars() as progress:
+    with _at_work(run, where) as (executor, progress):
         job = Job(Run(run), config, executor, progress, capture=opened, fps=opened.fps, model=model, tell=tell_note)
         yield agreeing_job(job)
 
 
 @contextmanager
 def scans_job(
-    scans: Path,
-    run: Path,
-    fps: float,
-    config: Config,
-    workers: int | None,
-    scheduler: str | None,
-    model: Path | None = None,
-    *,
-    wait: bool = False,
+    scans: Path, run: Path, fps: float, config: Config, where: Where, model: Path | None = None
 ) -> Iterator[Job]:
     """Make the job of a sequence of scans, with the subject's model if there is one."""
     opened = open_scans(scans, config.scans)
     _check_apart(scans, run)
     _check_model(model, run)
-    with working(run, wait), executor_for(workers, scheduler) as executor, progress_bars() as progress:
+    with _at_work(run, where) as (executor, progress):
         yield Job(Run(run), config, executor, progress, scans=opened, fps=fps, model=model, tell=tell_note)
+
+
+@contextmanager
+def _at_work(run: Path, where: Where) -> Iterator[tuple[Executor, Progress]]:
+    """Keep others out of a run, with an executor and progress bars."""
+    with working(run, where.wait), executor_for(where.workers, where.scheduler) as executor, progress_bars() as shown:
+        yield executor, shown
 
 
 def _check_model(model: Path | None, run: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from geomocap.cli.arguments import ExistingRun, Wait, Workers
+from geomocap.cli.arguments import ExistingRun, Host, Port, Wait, Workers
 from geomocap.cli.console import console
 from geomocap.cli.export_command import report_exported
 from geomocap.cli.reports import capture_of, existing_run, tell_faults, working
@@ -33,12 +33,8 @@ def keypoints(
     edit: Annotated[
         bool, typer.Option("--edit", help="Place, move and name them in the browser; needs the extra editor.")
     ] = False,
-    host: Annotated[
-        str, typer.Option("--host", help="Address that the page listens on; others than this one let others in.")
-    ] = "127.0.0.1",
-    port: Annotated[
-        int, typer.Option("--port", min=1, max=65535, help="Port of the page; the next free one if it is taken.")
-    ] = 8080,
+    host: Host = "127.0.0.1",
+    port: Port = 8080,
     workers: Workers = None,
     wait: Wait = False,
 ) -> None:

@@ -5,12 +5,14 @@ What does the work is imported when a command is called, so that its help comes 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from geomocap.cli.arguments import CaptureFolder, ModelFile, Pictures, RunFolder, Scheduler, Wait, Workers
+from geomocap.cli.app import COMMANDS
+from geomocap.cli.arguments import CaptureFolder, ModelFile, Pictures, RunFolder, Where
 from geomocap.cli.settings_options import with_settings
 from geomocap.config import Config
 from geomocap.settings import LEAST_FPS, MOST_FPS
@@ -19,74 +21,28 @@ Fps = Annotated[float, typer.Option("--fps", min=LEAST_FPS, max=MOST_FPS, help="
 BODIES = ("segmentation", "skeleton", "nodes", "motion_bodies", "motion_skeleton", "refinement", "following")
 
 
-@with_settings("cameras", "silhouettes")
-def silhouettes(
-    capture: CaptureFolder,
-    run: RunFolder,
-    config: Config,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    wait: Wait = False,
-) -> None:
-    """Cut the subject out of all images."""
-    from geomocap import pipeline
-    from geomocap.cli.jobs import capture_job
+def _stage(name: str, work: str, *sections: str) -> Callable[..., None]:
+    """Return the command that does a stage of a capture, after those that it needs."""
 
-    with capture_job(capture, run, config, workers, scheduler, wait=wait) as job:
-        pipeline.silhouettes(job)
+    @with_settings("cameras", "silhouettes", *sections)
+    def command(capture: CaptureFolder, run: RunFolder, config: Config, where: Where) -> None:
+        from geomocap import pipeline
+        from geomocap.cli.jobs import capture_job
+        from geomocap.cli.reports import tell_clouds
 
+        with capture_job(capture, run, config, where) as job:
+            getattr(pipeline, work)(job)
+        if work == "clouds":
+            tell_clouds(job.run)
 
-@with_settings("cameras", "silhouettes", "carving")
-def voxels(
-    capture: CaptureFolder,
-    run: RunFolder,
-    config: Config,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    wait: Wait = False,
-) -> None:
-    """Carve the surface voxels of all frames, silhouettes first where they are missing."""
-    from geomocap import pipeline
-    from geomocap.cli.jobs import capture_job
-
-    with capture_job(capture, run, config, workers, scheduler, wait=wait) as job:
-        pipeline.voxels(job)
+    command.__doc__ = COMMANDS[name][1]
+    return command
 
 
-@with_settings("cameras", "silhouettes", "carving", "cloud")
-def cloud(
-    capture: CaptureFolder,
-    run: RunFolder,
-    config: Config,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    wait: Wait = False,
-) -> None:
-    """Measure the surface by least squares matching: a dense point cloud for each frame."""
-    from geomocap import pipeline
-    from geomocap.cli.jobs import capture_job
-    from geomocap.cli.reports import tell_clouds
-
-    with capture_job(capture, run, config, workers, scheduler, wait=wait) as job:
-        pipeline.clouds(job)
-    tell_clouds(job.run)
-
-
-@with_settings("cameras", "silhouettes", "carving", "tracking", "windows", "filters", "smoothing")
-def track(
-    capture: CaptureFolder,
-    run: RunFolder,
-    config: Config,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    wait: Wait = False,
-) -> None:
-    """Follow points of the surface through all frames: trajectories with velocities and accelerations."""
-    from geomocap import pipeline
-    from geomocap.cli.jobs import capture_job
-
-    with capture_job(capture, run, config, workers, scheduler, wait=wait) as job:
-        pipeline.tracks(job)
+silhouettes = _stage("silhouettes", "silhouettes")
+voxels = _stage("voxels", "voxels", "carving")
+cloud = _stage("cloud", "clouds", "carving", "cloud")
+track = _stage("track", "tracks", "carving", "tracking", "windows", "filters", "smoothing")
 
 
 @with_settings("scans", *BODIES, "export")
@@ -96,19 +52,17 @@ def segment(
     ],
     run: RunFolder,
     config: Config,
+    where: Where,
     fps: Fps = 30.0,
     model: ModelFile = None,
     pictures: Pictures = True,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    wait: Wait = False,
 ) -> None:
     """Segment any sequence of scans into rigid bodies, joints and motion; one scan gets its ellipsoids."""
     from geomocap import pipeline
     from geomocap.cli.jobs import scans_job
     from geomocap.cli.reports import review_job, tell_results
 
-    with scans_job(scans, run, fps, config, workers, scheduler, model, wait=wait) as job:
+    with scans_job(scans, run, fps, config, where, model) as job:
         key = pipeline.motion_files(job, "scans")
         if pictures:
             review_job(job, key)
@@ -122,15 +76,13 @@ def run(
     capture: CaptureFolder,
     run: RunFolder,
     config: Config,
+    where: Where,
     preview: Annotated[
         bool, typer.Option("--preview", help="A quick look: some frames a second, small images, the same report.")
     ] = False,
     source: Annotated[Literal["voxels", "cloud"], typer.Option("--source", help="Geometry to work from.")] = "voxels",
     model: ModelFile = None,
     pictures: Pictures = True,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    wait: Wait = False,
 ) -> None:
     """Do everything: from a capture to bodies, skeleton, motion files and report.
 
@@ -148,7 +100,7 @@ def run(
     from geomocap.cli.jobs import capture_job
     from geomocap.cli.reports import review_job, tell_clouds, tell_results
 
-    with capture_job(capture, run, config, workers, scheduler, model, wait=wait, preview=preview) as job:
+    with capture_job(capture, run, config, where, model, preview=preview) as job:
         key = pipeline.motion_files(job, source)
         if pictures:
             review_job(job, key)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from geomocap.cli.arguments import MetresPerUnit, Workers
+from geomocap.cli.arguments import Host, MetresPerUnit, Port, Workers
 from geomocap.cli.console import console
 from geomocap.cli.foreign_calibrations import foreign_calibration
 from geomocap.cli.reports import capture_of, existing_run
@@ -30,12 +30,8 @@ def view(
     keypoints: Annotated[
         bool, typer.Option("--keypoints", help="Place and move key-points of a run, as `geomocap keypoints --edit`.")
     ] = False,
-    host: Annotated[
-        str, typer.Option("--host", help="Address that the page listens on; others than this one let others in.")
-    ] = "127.0.0.1",
-    port: Annotated[
-        int, typer.Option("--port", min=1, max=65535, help="Port of the page; the next free one if it is taken.")
-    ] = 8080,
+    host: Host = "127.0.0.1",
+    port: Port = 8080,
     rerun: Annotated[
         Path | None,
         typer.Option("--rerun", metavar="FILE.rrd", help="Write a Rerun recording instead; needs the extra rerun."),

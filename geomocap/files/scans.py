@@ -14,7 +14,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from geomocap.errors import GeometryError
 from geomocap.files.atomic import fingerprint
@@ -30,6 +29,7 @@ from geomocap.files.scan_geometry import (
     read_surface,
 )
 from geomocap.files.scan_settings import ScanSettings
+from geomocap.model.surface import point_spacing
 from geomocap.reading import list_folder
 
 _FARTHEST = 1e5  # diagonals from the origin; ten times farther the equations of motion lose their last digits
@@ -125,26 +125,15 @@ class Scans:
         """Distance of neighbouring points, metres: as set, or the first scan's mean distance to the nearest one."""
         points = self.points(0)
         if self.settings.spacing is None:
-            return point_spacing(points)
+            return point_spacing(points, np.mean)
         given = self.settings.spacing * self.settings.scale
         if len(points) > 1:
-            check_spacing(given, point_spacing(points), points)
+            check_spacing(given, point_spacing(points, np.mean), points)
         return given
 
     def fingerprint(self) -> str:
         """Digest of the files' names, sizes and times."""
         return fingerprint([self.source])
-
-
-def point_spacing(points: np.ndarray) -> float:
-    """Mean distance of points (N, 3) to their nearest neighbour, coincident points apart; units of the points."""
-    if len(points) < 2:
-        raise GeometryError("a scan of a single point has no spacing; set scans.spacing")
-    distance = cKDTree(points).query(points, k=2)[0][:, 1]
-    distance = distance[distance > 0]
-    if not len(distance):
-        raise GeometryError("all points of the scan coincide; is the file right?")
-    return float(distance.mean())
 
 
 def open_scans(source: Path, settings: ScanSettings) -> Scans:

@@ -7,7 +7,9 @@ bend badly.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -99,13 +101,21 @@ def _trimmed_poisson(
     return mesh
 
 
-def point_spacing(points: np.ndarray) -> float:
-    """Median distance of the points, (N, 3), to their nearest neighbours, metres."""
+def point_spacing(points: np.ndarray, average: Callable[[np.ndarray], Any] = np.median) -> float:
+    """Average distance of points (N, 3) to their nearest neighbours, coincident ones apart; units of the points.
+
+    Raises
+    ------
+    GeometryError
+        If there is a single point, or all coincide.
+    """
+    if len(points) < 2:
+        raise GeometryError("a single point has no spacing; set scans.spacing")
     distance = cKDTree(points).query(points, k=2)[0][:, 1]
-    positive = distance[distance > 0]
-    if len(positive) == 0:
-        raise GeometryError("all points lie in one place; there is no surface")
-    return float(np.median(positive))
+    distance = distance[distance > 0]
+    if not len(distance):
+        raise GeometryError("all points coincide; is the file right?")
+    return float(average(distance))
 
 
 def plane_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:

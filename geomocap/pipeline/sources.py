@@ -11,8 +11,8 @@ import numpy as np
 from geomocap.errors import GeometryError
 from geomocap.files.frame_files import read_points, read_voxels
 from geomocap.files.run import Run, stage_key
-from geomocap.files.scans import point_spacing
 from geomocap.model.frame_geometry import Geometry
+from geomocap.model.surface import point_spacing
 from geomocap.pipeline.cloud_stage import clouds
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.voxel_stage import voxels
@@ -54,7 +54,7 @@ class CloudFrames:
     @property
     def spacing(self) -> float:
         """Mean distance of a point of the first cloud from its nearest neighbour, metres."""
-        return point_spacing(self.points(0))
+        return point_spacing(self.points(0), np.mean)
 
     def __len__(self) -> int:
         return self.frames

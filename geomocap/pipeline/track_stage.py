@@ -15,8 +15,8 @@ from geomocap.files.frame_files import read_points, read_voxels
 from geomocap.files.results import TRACKS, join_tracks, read_silhouette, write_tracks
 from geomocap.files.run import Run, stage_key
 from geomocap.files.run_window import RunWindow
-from geomocap.files.scans import point_spacing
 from geomocap.model.frame_geometry import Voxels
+from geomocap.model.surface import point_spacing
 from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.patches.point_tracking import track_points
@@ -98,7 +98,9 @@ class _TrackWindow:
 
 def frame_reader(capture: Capture, run: Run, settings: TrackingSettings) -> ReadFrame:
     """Return what reads the frames of a run for tracking; the first one tells how far images may be reduced."""
-    spacing = None if _has_hull(capture) else _CLOSED * point_spacing(read_points(run.frame_file("cloud", 0)).positions)
+    spacing = None
+    if not _has_hull(capture):
+        spacing = _CLOSED * point_spacing(read_points(run.frame_file("cloud", 0)).positions, np.mean)
     read = ReadFrame(capture, run, settings, Undistortion.of(capture.rig), settings.reduction or 1, spacing)
     return read if settings.reduction else replace(read, reduction=image_reduction(read(0), settings))
 

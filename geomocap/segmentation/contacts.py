@@ -1,22 +1,13 @@
-"""Which sets of points touch: neighbours in a hashed grid whose cells are as large as the point spacing."""
+"""Which sets of points touch: neighbours in a grid whose cells are as large as the point spacing."""
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
-from numba import njit
+from scipy.sparse import csr_matrix
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _slot(key: int, table: np.ndarray) -> int:
-    """Place of a key in an open hash table, or the free place where it belongs; the table's length is a power of 2."""
-    mask = table.shape[0] - 1
-    place = (key * 0x9E3779B97F4A7C1) >> 20 & mask
-    while table[place] != key and table[place] != -1:
-        place = (place + 1) & mask
-    return place
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def count_contacts(points: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
     """Count the neighbouring pairs of points between each two sets.
 
@@ -36,63 +27,23 @@ def count_contacts(points: np.ndarray, labels: np.ndarray, count: int) -> np.nda
     (K, K) int32
         Symmetric; zero on the diagonal.
     """
-    n = points.shape[0]
-    contacts = np.zeros((count, count), np.int32)
-    if n == 0:
-        return contacts
-    low = points[0].copy()
-    high = points[0].copy()
-    for i in range(n):
-        for a in range(3):
-            low[a] = min(low[a], points[i, a])
-            high[a] = max(high[a], points[i, a])
+    if not len(points):
+        return np.zeros((count, count), np.int32)
     # one empty layer around, so that a neighbour's key never wraps into the next row
-    ny = np.int64(np.floor(high[1] - low[1] + 0.5)) + 3
-    nz = np.int64(np.floor(high[2] - low[2] + 0.5)) + 3
-    size = 16
-    while size < 2 * n:
-        size *= 2
-    table = np.full(size, -1, np.int64)
-    first = np.full(size, -1, np.int32)
-    after = np.full(n, -1, np.int32)
-    keys = np.empty(n, np.int64)
-    for i in range(n):
-        x = np.int64(np.floor(points[i, 0] - low[0] + 0.5)) + 1
-        y = np.int64(np.floor(points[i, 1] - low[1] + 0.5)) + 1
-        z = np.int64(np.floor(points[i, 2] - low[2] + 0.5)) + 1
-        keys[i] = (x * ny + y) * nz + z
-        place = _slot(keys[i], table)
-        table[place] = keys[i]
-        after[i] = first[place]
-        first[place] = i
-    steps = np.empty(13, np.int64)
-    filled = 0
-    for dx in range(2):
-        for dy in range(-1, 2):
-            for dz in range(-1, 2):
-                if dx > 0 or dy > 0 or (dy == 0 and dz > 0):
-                    steps[filled] = (dx * ny + dy) * nz + dz
-                    filled += 1
-    for i in range(n):
-        a = labels[i]
-        if a < 0:
-            continue
-        j = after[i]  # the rest of its own cell
-        while j >= 0:
-            b = labels[j]
-            if b >= 0 and b != a:
-                contacts[a, b] += 1
-                contacts[b, a] += 1
-            j = after[j]
-        for s in range(13):
-            place = _slot(keys[i] + steps[s], table)
-            j = first[place]
-            while j >= 0:
-                b = labels[j]
-                if b >= 0 and b != a:
-                    contacts[a, b] += 1
-                    contacts[b, a] += 1
-                j = after[j]
+    cells = np.floor(points - points.min(axis=0) + 0.5).astype(np.int64) + 1
+    shape = cells.max(axis=0) + 2
+    known = labels >= 0
+    keys, cell = np.unique(np.ravel_multi_index(tuple(cells[known].T), tuple(shape)), return_inverse=True)
+    held = csr_matrix((np.ones(len(cell), np.int32), (cell, labels[known])), shape=(len(keys), count))
+    contacts = (held.T @ held).toarray()
+    for x, y, z in product((0, 1), (-1, 0, 1), (-1, 0, 1)):
+        if (x, y, z) > (0, 0, 0):  # each two cells once
+            step = (x * shape[1] + y) * shape[2] + z
+            beside = np.searchsorted(keys, keys + step) % len(keys)
+            one = np.flatnonzero(keys[beside] == keys + step)
+            between = (held[one].T @ held[beside[one]]).toarray()
+            contacts += between + between.T
+    np.fill_diagonal(contacts, 0)
     return contacts
 
 

@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.errors import GeometryError
+from geomocap.model.motion_paths import FOLLOWED
 from geomocap.model.skeleton import Skeleton, bone_fixed_skeleton
 from geomocap.skeleton.articulated_adjustment import adjust
 from geomocap.skeleton.body_observations import Observations, SkinPoints
@@ -108,7 +109,7 @@ def possible_connections(bodies: MotionBodies, settings: MotionSkeletonSettings)
     contact = contacts(bodies)
     whole = np.maximum(contact.sum(axis=1), 1)
     weights = (settings.interface_weight, settings.gap_weight, settings.contact_weight * bodies.diagonal)
-    noise = 2e-4 * bodies.diagonal
+    noise = FOLLOWED * bodies.diagonal
     result = []
     for (a, b), border in borders.items():
         motions = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from geomocap.model.motion_paths import FOLLOWED
 from geomocap.settings import Settings
 
 
@@ -40,7 +41,7 @@ class RefinementSettings(Settings):
         default=0.3, gt=0, le=1, description="fraction of the observations that err independently of each other (0..1)"
     )
     noise: float = Field(
-        default=2e-4, gt=0, description="least standard deviation of how a sample follows its bodies (diagonals)"
+        default=FOLLOWED, gt=0, description="least standard deviation of how a sample follows its bodies (diagonals)"
     )
     joint_sigma: float = Field(
         default=2e-3,

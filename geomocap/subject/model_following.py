@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
-from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.motion_paths import FOLLOWED, MotionPaths
 from geomocap.model.rotations import turn_angles
 from geomocap.progress import Progress, silent
 from geomocap.skeleton.articulated_adjustment import adjust
@@ -34,7 +34,6 @@ from geomocap.subject.surface_matching import (
 
 _STAGE = "model"
 _REACH = 3.0  # standard deviations of the surface
-_NOISE = 2e-4  # diagonals
 _PATH_ROUNDS = 2  # the second with what the first has put right
 # Of the motion, followed side by side: with one, a dancer's folded arm was lost for the last 30 of 107 frames; with
 # three it was found again. More weren't tried, as each costs as much time as the first.
@@ -311,7 +310,7 @@ def _fit_all(
         for _ in range(_PATH_ROUNDS):
             bodies = body_motion(linkage, motion)
             skin = attach_paths(model, bodies, paths, reach)
-            motion = turned_by_paths(linkage, motion, bodies, skin, paths, _NOISE * model.diagonal)
+            motion = turned_by_paths(linkage, motion, bodies, skin, paths, FOLLOWED * model.diagonal)
     for _ in range(settings.rounds):
         bodies = body_motion(linkage, motion)
         points = surface.skin

@@ -22,7 +22,7 @@ _EVERY = 3  # frames between two looks
 _BINS = 8  # of turns, with as many misses in each
 _LEAST = 300  # misses by which a factor is known
 _CHI2_MEDIAN = 2.366  # of three freedoms
-_LEAST_FACTOR = 0.25  # neighbours fraction some of what is wrong
+_LEAST_FACTOR = 0.25  # neighbours share some of what is wrong
 _PRIOR = 3.0  # freedoms that the common factor has against those of a miss of its own
 
 

@@ -154,7 +154,7 @@ def test_frames_and_points_that_make_no_skin(arm_run):
         skin_from_run(arm_run, motion, ExportSettings(skin_colors="true"))
     with pytest.raises(GeometryError, match="3 points are too few"):
         surface_through(np.eye(3))
-    with pytest.raises(GeometryError, match="all points lie in one place"):
+    with pytest.raises(GeometryError, match="all points coincide"):
         point_spacing(np.zeros((60, 3)))
     with pytest.raises(MotionError, match="body 7 has points but no place"):
         node_of_body(motion, np.array([0, 1, 7]))
