@@ -6,30 +6,25 @@ what the user does. Everybody who opens the page sees and edits the same.
 
 from __future__ import annotations
 
-import contextlib
-import io
-import threading
-import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from geomocap.errors import GeomocapError
-from geomocap.export.export_errors import require
 from geomocap.keypoints.keypoint_regions import KeyPointFile
 from geomocap.model.rig import Rig
-from viz.floor import grid_spacing
 from viz.keypoint_marks import BRIDGED, CHOSEN, LINK, MEASURED
 from viz.keypoint_panel import Panel
 from viz.keypoint_scene import POINTS, Subject, marks_of
 from viz.keypoint_session import Follower, Session, pick_ball, pick_surface
-from viz.local_page import serve_page
+from viz.scene_page import ScenePage
+from viz.view_shapes import quaternion, vertical_fov
 
 _FIELD_DEG = 32.0  # field of view that the whole motion fills at first
 
 
-class KeyPointEditor:
+class KeyPointEditor(ScenePage):
     """The page and its server.
 
     Parameters
@@ -63,11 +58,8 @@ class KeyPointEditor:
         port: int = 8080,
     ) -> None:
         purpose = "Editing key-points in the browser"
-        viser = require("viser", extra="editor", purpose=purpose)
+        super().__init__("geomocap key-points", host, port, extra="editor", purpose=purpose)
         self.subject, self.follow, self.session, self.save = subject, follow, session, save
-        self._to_quaternion = lambda R: viser.transforms.SO3.from_matrix(R).wxyz
-        self.server = serve_page("geomocap key-points", host, port, extra="editor", purpose=purpose)
-        self._lock = threading.RLock()
         self._dragged: Session | None = None  # as it was when the handles were grabbed
         self._balls: list[tuple[Any, Any]] = []
         self._surface = subject.surface(0)
@@ -77,27 +69,8 @@ class KeyPointEditor:
         self._draw_frame()
         self._refresh()
 
-    @property
-    def url(self) -> str:
-        """Where the page is."""
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
-
-    def serve(self, wanted: Callable[[], bool] = lambda: True) -> None:
-        """Play when asked to, until `wanted` says no or the process is interrupted; then stop the server."""
-        try:
-            due = time.monotonic()
-            while wanted():
-                if self.panel.playing:
-                    self._step(1)
-                due = max(due + 1 / min(self.subject.fps, 15.0), time.monotonic() + 0.005)
-                time.sleep(due - time.monotonic())
-        finally:
-            self.stop()
-
-    def stop(self) -> None:
-        """Stop the server."""
-        with contextlib.redirect_stdout(io.StringIO()):
-            self.server.stop()
+    def _pace(self) -> tuple[float, int]:
+        return min(self.subject.fps, 15.0), 1
 
     # --- what the user does ---
 
@@ -198,9 +171,9 @@ class KeyPointEditor:
             return
         c = rig.names.index(self.panel.camera)
         with client.atomic():
-            client.camera.wxyz = self._to_quaternion(rig.cam_from_world[c, :, :3].T)
+            client.camera.wxyz = quaternion(rig.cam_from_world[c, :, :3].T)
             client.camera.position = rig.centers[c]
-            client.camera.fov = _vertical_fov(rig, c)
+            client.camera.fov = vertical_fov(rig, c)
 
     # --- what is shown ---
 
@@ -211,20 +184,11 @@ class KeyPointEditor:
     def _set_stage(self) -> None:
         """Draw what stays: floor, first view, handles, cameras."""
         stage, scene = self.subject.stage, self.server.scene
-        scene.set_up_direction(stage.up)
         view = stage.view(35.0, 12.0, (800, 800), _FIELD_DEG)
         R, t = view.cam_from_world[:, :3], view.cam_from_world[:, 3]
-        first = self.server.initial_camera
-        first.position, first.look_at = -R.T @ t, R.T @ (np.array([0, 0, t[2]]) - t)
-        first.up, first.fov = stage.up, np.radians(1.15 * _FIELD_DEG)
-        step = grid_spacing(stage.diagonal)
-        size = 12 * step
-        plane = {0: "yz", 1: "xz", 2: "xy"}[int(np.argmax(np.abs(stage.up)))]
-        middle = stage.centers[0] - stage.up * (stage.centers[0] @ stage.up - stage.floor)
-        middle = np.where(stage.up > 0.5, middle, np.round(middle / step) * step)
-        scene.add_grid(
-            "/floor", size, size, plane=plane, cell_size=step, section_size=5 * step, shadow_opacity=0, position=middle
-        )
+        ahead = np.array([0, 0, t[2]])
+        self._begin_at(stage, R.T @ (ahead - t), R.T @ ahead, _FIELD_DEG)
+        self._add_grid(stage, stage.centers[0], 12, snapped=True, shadow_opacity=0)
         self._handles = scene.add_transform_controls(
             "/handles", scale=0.08 * stage.diagonal, disable_rotations=True, depth_test=False, visible=False
         )
@@ -233,47 +197,15 @@ class KeyPointEditor:
         if rig is not None:
             away = float(np.median(np.linalg.norm(rig.centers - stage.centers[0], axis=1)))
             for c, name in enumerate(rig.names):
-                width, height = rig.sizes[c]
-                self._frusta[name] = scene.add_camera_frustum(
-                    f"/cameras/{name}",
-                    fov=_vertical_fov(rig, c),
-                    aspect=float(width / height),
-                    scale=0.12 * away,
-                    thickness=0.002 * away,
-                    color=(31, 95, 139),
-                    wxyz=self._to_quaternion(rig.cam_from_world[c, :, :3].T),
-                    position=rig.centers[c],
-                )
+                look = {"thickness": 0.002 * away}
+                self._frusta[name] = self._add_camera(f"/cameras/{name}", rig, c, 0.12 * away, **look)
 
     def _draw_frame(self) -> None:
         """Draw what belongs to the frame and not to key-points: surface, trails, pictures in the cameras."""
-        frame, panel, scene = self.panel.frame, self.panel, self.server.scene
+        frame, panel = self.panel.frame, self.panel
         with self._lock, self.server.atomic():
-            shown = self._surface.thinned(POINTS).shaded()
-            if len(shown.points):
-                middle = shown.points.mean(axis=0)  # so that half precision is enough
-                scene.add_point_cloud(
-                    "/surface",
-                    shown.points - middle,
-                    shown.colors,
-                    point_size=1.15 * shown.spacing,
-                    point_shape="circle",
-                    point_shading="flat",
-                    position=middle,
-                    visible=panel.shows("surface"),
-                )
-            segments, colors = self.subject.trails(frame, panel.trails)
-            if len(segments):
-                scene.add_line_segments(
-                    "/trails",
-                    segments,
-                    colors,
-                    thickness=2.0,
-                    thickness_units="screen",
-                    visible=panel.trails != "none",
-                )
-            elif (old := scene.get_handle_by_name("/trails")) is not None:
-                old.remove()
+            self._draw_points("/surface", self._surface, POINTS, 1.15, visible=panel.shows("surface"))
+            self._draw_lines("/trails", *self.subject.trails(frame, panel.trails), 2.0)
             for name, frustum in self._frusta.items():
                 frustum.visible = panel.shows("cameras")
                 if panel.shows("cameras"):
@@ -286,7 +218,7 @@ class KeyPointEditor:
             paths = self.follow(self.session.file)
             marks = marks_of(self.session.file, paths, self.session.chosen)
             self._draw_balls(paths.positions[self.panel.frame], paths.bridged[self.panel.frame])
-            self._draw_links(marks.positions[self.panel.frame][marks.links], "/links", LINK, 3.0)
+            self._draw_known("/links", marks.positions[self.panel.frame][marks.links], LINK, 3.0)
             self._draw_path(paths.positions, paths.bridged)
             self.panel.fill(self.session, paths, marks, typing=typing)
         self._draw_picture()
@@ -316,24 +248,19 @@ class KeyPointEditor:
         if self.session.point is None:
             self._handles.visible = False
 
-    def _draw_links(self, ends: np.ndarray, name: str, color: Any, thickness: float) -> None:
-        ends = ends[np.isfinite(ends).all(axis=(1, 2))]
-        old = self.server.scene.get_handle_by_name(name)
-        if len(ends):
-            self.server.scene.add_line_segments(name, ends, color, thickness=thickness, thickness_units="screen")
-        elif old is not None:
-            old.remove()
+    def _draw_known(self, name: str, ends: np.ndarray, color: Any, width: float) -> None:
+        self._draw_lines(name, ends[np.isfinite(ends).all(axis=(1, 2))], color, width)
 
     def _draw_path(self, positions: np.ndarray, bridged: np.ndarray) -> None:
         """Draw the way of the chosen key-point through all frames."""
         if self.session.chosen is None:
-            self._draw_links(np.zeros((0, 2, 3)), "/path", CHOSEN, 2.0)
+            self._remove("/path")
             return
         k = self.session.file.names.index(self.session.chosen)
         ends = np.stack([positions[:-1, k], positions[1:, k]], axis=1)
         color = np.where(bridged[1:, k, None], np.array(BRIDGED), np.array(CHOSEN)).astype(np.uint8)
         known = np.isfinite(ends).all(axis=(1, 2))
-        self._draw_links(ends, "/path", np.repeat(color[known][:, None], 2, axis=1), 3.0)
+        self._draw_lines("/path", ends[known], np.repeat(color[known][:, None], 2, axis=1), 3.0)
 
     def _draw_picture(self) -> None:
         """Draw one camera's picture with the key-points over it."""
@@ -343,8 +270,3 @@ class KeyPointEditor:
                 self.panel.picture(self.subject.picture(self.panel.camera, self.panel.frame, 560, marks))
             else:
                 self.panel.picture(None)
-
-
-def _vertical_fov(rig: Rig, camera: int) -> float:
-    """Vertical field of view of a camera, radians."""
-    return float(2 * np.arctan(rig.sizes[camera, 1] / 2 / rig.cameras[camera].focal_length_y))

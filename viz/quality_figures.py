@@ -152,7 +152,7 @@ class PathFigures:
     Attributes
     ----------
     relative : (T, K, 3) float, metres
-        PathFigures minus their means over time.
+        Paths minus their means over time.
     seed : int
         Ellipsoid nearest to the centre of gravity in the first frame, or the first seed that the run recorded.
     distance : (T, K) float, metres
@@ -251,7 +251,7 @@ def warnings(results: Results, quality: Quality) -> list[str]:
             if cut.any():
                 said.append(
                     f"{camera}: the silhouette reaches the image's border in {int(cut.sum())} of {len(cut)} frames; "
-                    "what is out of its ray there is left to the other cameras."
+                    "what is out of its sight there is left to the other cameras."
                 )
     for camera, (covered, inside) in quality.agreement.items():
         if covered < 0.9:

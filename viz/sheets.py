@@ -117,10 +117,10 @@ def story_sheet(
 ) -> np.ndarray:
     """Return the way from the geometry to the skeleton: stages as rows, frames as columns, one view."""
     azimuth, elevation = VIEWS["three-quarter"]
-    ray = stage.view(azimuth, elevation, tile_size(stage, azimuth, elevation))
+    view = stage.view(azimuth, elevation, tile_size(stage, azimuth, elevation))
 
     def column(frame: int) -> list[np.ndarray]:
-        return [picture(results, stage, Model(build(results, frame)), ray, frame) for _, build in rows]
+        return [picture(results, stage, Model(build(results, frame)), view, frame) for _, build in rows]
 
     with threads() as executor:
         columns = list(map_items(column, list(frames), executor))

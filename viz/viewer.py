@@ -6,11 +6,7 @@ confidences when they are clicked, and those of runs can be renamed.
 
 from __future__ import annotations
 
-import contextlib
-import io
-import threading
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,23 +14,19 @@ import numpy as np
 from geomocap.errors import GeomocapError
 from geomocap.model.palette import body_color, body_colors
 from viz import shapes
-from viz.floor import grid_spacing
-from viz.keypoint_scene import SceneSurface
-from viz.local_page import serve_page
+from viz.scene_page import ScenePage
 from viz.shown_names import rename
 from viz.view_content import Content, of_run
 from viz.view_panel import Chosen, ViewPanel
-from viz.view_shapes import body_pieces, quaternion, vertical_fov
+from viz.view_shapes import body_pieces, quaternion
 
-POINTS = 30_000
-"""Points that are drawn at most."""
-
+_POINTS = 30_000  # that are drawn at most
 _FIELD_DEG = 30.0
 _JOINT = (44, 51, 61)
 _MARKER = (214, 40, 90)
 
 
-class Viewer:
+class Viewer(ScenePage):
     """The page and its server.
 
     Parameters
@@ -56,11 +48,9 @@ class Viewer:
 
     def __init__(self, contents: Sequence[Content], host: str = "127.0.0.1", port: int = 8080) -> None:
         self.contents = list(contents)
-        self._lock = threading.RLock()
         self._stages = [content.stage for content in self.contents]
         title = " | ".join(content.title for content in self.contents)
-        purpose = "Pages that show a run"
-        self.server = serve_page(f"geomocap: {title}", host, port, extra="view", purpose=purpose)
+        super().__init__(f"geomocap: {title}", host, port, extra="view", purpose="Pages that show a run")
         self.server.scene.world_axes.visible = False
         self.server.scene.configure_fog(0.0, 1.0, enabled=False)  # large subjects stand far from the eye
         self.chosen: Chosen | None = None
@@ -73,41 +63,20 @@ class Viewer:
         self.draw()
 
     @property
-    def url(self) -> str:
-        """Where the page is."""
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
-
-    @property
     def n_frames(self) -> int:
         """Frames of the longest content, at the first one's rate."""
         return self.panel.n_frames
 
-    def serve(self, wanted: Callable[[], bool] = lambda: True) -> None:
-        """Play when asked to, until `wanted` says no or the process is interrupted; then stop the server."""
-        try:
-            due = time.monotonic()
-            while wanted():
-                rate = min(self.contents[0].fps * self.panel.speed, 20.0)
-                if self.panel.playing:
-                    step = max(1, round(self.contents[0].fps * self.panel.speed / rate))
-                    self.panel.frame = (self.panel.frame + step) % self.n_frames
-                    self.draw()
-                due = max(due + 1 / rate, time.monotonic() + 0.005)
-                time.sleep(due - time.monotonic())
-        finally:
-            self.stop()
-
-    def stop(self) -> None:
-        """Stop the server."""
-        with contextlib.redirect_stdout(io.StringIO()):
-            self.server.stop()
+    def _pace(self) -> tuple[float, int]:
+        speed = self.contents[0].fps * self.panel.speed
+        rate = min(speed, 20.0)
+        return rate, max(1, round(speed / rate))
 
     # --- what stays ---
 
     def _set_view(self) -> None:
         """Set floor and first view so that all is taken in."""
-        stage, scene = self._stages[0], self.server.scene
-        scene.set_up_direction(stage.up)
+        stage = self._stages[0]
         wide = sum(s.diagonal for s in self._stages)
         view = stage.view(30.0, 12.0, (800, 800), _FIELD_DEG)
         R, t = view.cam_from_world[:, :3], view.cam_from_world[:, 3]
@@ -116,14 +85,8 @@ class Viewer:
         if len(self.contents) > 1:  # both beside the panel
             away *= wide / stage.diagonal
             middle = middle + 0.2 * wide * R[0]
-        first = self.server.initial_camera
-        first.look_at, first.position = middle, middle - away
-        first.up, first.fov = stage.up, np.radians(1.15 * _FIELD_DEG)
-        step = grid_spacing(stage.diagonal)
-        plane = {0: "yz", 1: "xz", 2: "xy"}[int(np.argmax(np.abs(stage.up)))]
-        base = middle - stage.up * (middle @ stage.up - stage.floor)
-        size = 16 * step * max(1.0, wide / stage.diagonal)
-        scene.add_grid("/floor", size, size, plane=plane, cell_size=step, section_size=5 * step, position=base)
+        self._begin_at(stage, middle, away, _FIELD_DEG)
+        self._add_grid(stage, middle, 16 * max(1.0, wide / stage.diagonal))
 
     @property
     def _offsets(self) -> list[np.ndarray]:
@@ -180,15 +143,8 @@ class Viewer:
         if content.rig is not None:
             rig, away = content.rig, np.linalg.norm(content.rig.centers - stage.centers[0], axis=1)
             for c, name in enumerate(rig.names):
-                made["cameras"][name] = scene.add_camera_frustum(
-                    f"/{k}/cameras/{c}",
-                    fov=vertical_fov(rig, c),
-                    aspect=float(rig.sizes[c, 0] / rig.sizes[c, 1]),
-                    scale=0.14 * float(np.median(away)),
-                    color=(31, 95, 139),
-                    wxyz=quaternion(rig.cam_from_world[c, :, :3].T),
-                    position=rig.centers[c],
-                )
+                scale = 0.14 * float(np.median(away))
+                made["cameras"][name] = self._add_camera(f"/{k}/cameras/{c}", rig, c, scale)
         return made
 
     def _wire(self) -> None:
@@ -273,7 +229,7 @@ class Viewer:
                 ball.visible, label.visible = known, known and shows("names")
                 if known:
                     ball.position, label.position = place, place + self._stages[k].up * 0.02 * self._stages[k].diagonal
-        self._cloud(k, content.points(frame) if shows("points") else None)
+        self._draw_points(f"/{k}/points", content.points(frame) if shows("points") else None, _POINTS, 1.1)
         self._followed(k, content, frame)
         self._ellipsoids(k, content, frame)
         for name, frustum in made["cameras"].items():
@@ -289,18 +245,6 @@ class Viewer:
             mesh.visible, mesh.opacity = shown, 0.4 if self.panel.surface == "glass" else None
             if vertices is not None:
                 mesh.vertices = vertices[used]
-
-    def _cloud(self, k: int, surface: SceneSurface | None) -> None:
-        name = f"/{k}/points"
-        if surface is None or not len(surface.points):
-            self._remove(name)
-            return
-        shown = surface.thinned(POINTS).shaded()
-        middle = shown.points.mean(axis=0)  # so that half precision is enough
-        self.server.scene.add_point_cloud(
-            name, shown.points - middle, shown.colors, point_size=1.1 * shown.spacing, point_shape="circle",
-            point_shading="flat", position=middle,
-        )  # fmt: skip
 
     def _followed(self, k: int, content: Content, frame: int) -> None:
         """Draw the points that the bodies were found from, where they are in this frame."""
@@ -340,16 +284,8 @@ class Viewer:
         self._lines(f"/{k}/trails", ends, colors, 2.0)
 
     def _lines(self, name: str, ends: np.ndarray, colors: Sequence[Sequence[int]], width: float) -> None:
-        if not len(ends):
-            self._remove(name)
-            return
-        shade = np.repeat(np.array(colors, np.uint8)[:, None], 2, axis=1)
-        self.server.scene.add_line_segments(name, ends, shade, thickness=width, thickness_units="screen")
-
-    def _remove(self, name: str) -> None:
-        old = self.server.scene.get_handle_by_name(name)
-        if old is not None:
-            old.remove()
+        """Draw lines, each in its colour."""
+        self._draw_lines(name, ends, np.repeat(np.array(colors, np.uint8)[:, None], 2, axis=1), width)
 
     def _draw_picture(self) -> None:
         """Show the picture of the camera that is chosen in the panel."""

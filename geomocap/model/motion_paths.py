@@ -10,7 +10,6 @@ from geomocap.errors import GeometryError
 
 _LEAST_FRAMES = 2
 DEPTH_FRACTION = 0.1  # of what is missed along a ray, counts
-FOLLOWED = 2e-4  # diagonals; no surface is followed more exactly, whatever is stated
 _GIVE = 0.001  # diagonals; what surfaces give although they belong to a rigid body
 
 

@@ -10,14 +10,13 @@ from scipy.sparse.csgraph import connected_components
 
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.errors import GeometryError
-from geomocap.model.motion_paths import FOLLOWED
 from geomocap.model.skeleton import Skeleton, bone_fixed_skeleton
 from geomocap.skeleton.articulated_adjustment import adjust
 from geomocap.skeleton.body_observations import Observations, SkinPoints
 from geomocap.skeleton.borders import Border, contacts, find_borders
 from geomocap.skeleton.common_points import CommonPoint, common_point
 from geomocap.skeleton.kinematics import BodyMotion, Linkage, joint_motion
-from geomocap.skeleton.motion_skeleton_settings import MotionSkeletonSettings
+from geomocap.skeleton.motion_skeleton_settings import FOLLOWED, MotionSkeletonSettings
 from geomocap.skeleton.spanning_tree import Connection, connect_by_cost, connection_cost
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from geomocap.model.motion_paths import FOLLOWED
 from geomocap.settings import Settings
+
+FOLLOWED = 2e-4  # diagonals; no surface is followed more exactly, whatever is stated
 
 
 class MotionSkeletonSettings(Settings):
