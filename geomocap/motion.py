@@ -13,6 +13,7 @@ from geomocap.bodies.motion_bodies import MotionBodies, MotionBodiesSettings
 from geomocap.bodies.point_labels import label_points
 from geomocap.bodies.ray_depths import find_bodies_and_depths
 from geomocap.errors import GeometryError
+from geomocap.model.even_choice import evenly_chosen
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.outlines import Outlines
 from geomocap.model.skeleton import Skeleton
@@ -207,7 +208,7 @@ def _labels_of_all(tracks: np.ndarray, samples: np.ndarray, bodies: MotionBodies
     """Bodies of all tracks, (N,) int32: of a sample its own, of another one by where it lies in some frame."""
     labels = np.full(len(tracks), -1, np.int32)
     seen = np.isfinite(tracks).all(axis=2)
-    frames = np.unique(np.linspace(0, tracks.shape[1] - 1, _LABEL_FRAMES).round().astype(int))
+    frames = evenly_chosen(tracks.shape[1], _LABEL_FRAMES)
     for frame in (*frames, *np.setdiff1d(np.arange(tracks.shape[1]), frames)):
         some = np.flatnonzero(seen[:, frame] & (labels < 0))
         if len(some):

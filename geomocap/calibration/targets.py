@@ -8,6 +8,7 @@ import numpy as np
 from geomocap.calibration.calibration_settings import TargetSettings
 from geomocap.calibration.disc import fit_disc
 from geomocap.files.capture import FrameSource
+from geomocap.model.even_choice import evenly_chosen
 
 SATURATION = 254.0
 
@@ -24,8 +25,7 @@ def still_background(source: FrameSource, frames: np.ndarray, settings: TargetSe
 
     The median of some frames: the bar itself is nowhere long enough to be part of it.
     """
-    count = min(settings.background_frames, len(frames))
-    picked = np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))
+    picked = evenly_chosen(len(frames), settings.background_frames)
     stack = [gray_of(source.read(int(frames[k]))).astype(np.uint8) for k in picked]
     return np.median(np.stack(stack), axis=0).astype(np.float32)
 

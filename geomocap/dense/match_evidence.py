@@ -17,6 +17,7 @@ from geomocap.matching.growing import SurfaceMatches
 from geomocap.matching.lsm import match_multi
 from geomocap.matching.matching_settings import KernelSettings
 from geomocap.matching.spline import ImageStack
+from geomocap.model.even_choice import evenly_chosen
 
 _LEAST = 30  # matches by which an image is judged
 
@@ -108,7 +109,7 @@ def epipolar_residuals(
     chosen = [np.zeros(0, np.int64)]
     for seen in surface.seen.T:
         cells = np.flatnonzero(seen)
-        chosen.append(cells[np.unique(np.linspace(0, len(cells) - 1, min(sample, len(cells))).round().astype(int))])
+        chosen.append(cells[evenly_chosen(len(cells), sample)])
     cells = np.unique(np.concatenate(chosen))
     m = surface.matches
     start = np.concatenate([m.positions[cells], m.affine[cells].reshape(len(cells), len(transfers), 4)], axis=2)

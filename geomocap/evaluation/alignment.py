@@ -18,6 +18,7 @@ from scipy.optimize import linear_sum_assignment, minimize_scalar
 from geomocap.evaluation.evaluation_settings import EvaluationSettings
 from geomocap.evaluation.marker_track import MarkerTrack
 from geomocap.evaluation.result import Alignment, EvaluationError
+from geomocap.model.even_choice import evenly_chosen
 from geomocap.model.rotations import rigid_motion
 
 Pairs = list[tuple[int, int]]
@@ -99,7 +100,7 @@ def _fit_at(
     other = track.at(times + offset)
     starts = _starts(found, other) if settings.align else [Alignment(np.eye(3), np.zeros(3), offset)]
     if len(starts) > 1:
-        few = np.unique(np.linspace(0, len(found) - 1, FEW_FRAMES).round().astype(int))
+        few = evenly_chosen(len(found), FEW_FRAMES)
         tried = [_match_and_fit(found[few], other[few], s, diagonal, True, pairs, rounds=FEW_ROUNDS) for s in starts]
         ranked = sorted((fit for fit in tried if fit is not None), key=lambda fit: fit.cost)
         starts = [fit.alignment for fit in ranked[:KEPT_STARTS]]

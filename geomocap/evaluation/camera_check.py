@@ -15,6 +15,7 @@ import numpy as np
 
 from geomocap.carving.silhouette_views import Undistortion
 from geomocap.files.capture import Capture
+from geomocap.model.even_choice import evenly_chosen
 from geomocap.model.rig import reduction
 from geomocap.model.rig_doubts import rig_doubts
 from geomocap.progress import Progress, silent
@@ -91,7 +92,7 @@ def check_cameras_of(
     """
     rig = capture.rig if capture.is_calibrated else None
     doubts = rig_doubts(rig) if rig is not None else []
-    frames = np.unique(np.linspace(0, capture.n_frames - 1, FRAMES).round().astype(int)).tolist()
+    frames = evenly_chosen(capture.n_frames, FRAMES).tolist()
     look = _Look(capture, tuple(frames), settings or SilhouetteSettings())
     looks = list(map_items(look, capture.cameras, executor, "cameras", progress, 4))
     warnings = [w for found in looks for w in found.warnings]
@@ -175,9 +176,7 @@ class _Look:
             if capture.n_recorded < BACKGROUND_FRAMES:
                 return CameraLook(None, None, tuple(warnings))
             source = capture.sources[camera]
-            chosen = np.unique(
-                np.linspace(0, len(source) - 1, min(self.settings.samples, SAMPLES, len(source))).round()
-            )
+            chosen = evenly_chosen(len(source), min(self.settings.samples, SAMPLES))
             model = model_from_frames(
                 [self._shrink(camera, source.read(int(k))) for k in chosen], self.settings, camera
             )

@@ -26,6 +26,7 @@ from geomocap.files.capture import Capture
 from geomocap.files.corrected_cameras import as_seen
 from geomocap.files.results import read_diagnostics, read_silhouette, read_skeleton
 from geomocap.files.run import Run
+from geomocap.model.even_choice import evenly_chosen
 from geomocap.model.ray_casting import TriangleScene
 from geomocap.model.rig import Rig
 from geomocap.model.self_check import SelfCheck
@@ -81,7 +82,7 @@ def model_overlap(run: Run, capture: Capture, model: SubjectModel, skeleton: Ske
 
 def _looks(motion: BodyMotion) -> list[int]:
     """Return the frames that are looked at."""
-    return np.unique(np.linspace(0, len(motion.rotations) - 1, FRAMES).round().astype(int)).tolist()
+    return evenly_chosen(len(motion.rotations), FRAMES).tolist()
 
 
 def _views(run: Run, capture: Capture) -> Callable[[int], PinholeViews]:

@@ -52,29 +52,15 @@ class SweepImages:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def sweep(
-    flat,
-    seen,
-    shapes,
-    starts,
-    transfers,
-    points,
-    bounds,
-    focal,
-    radius,
-    step,
-    tilt,
-    tilts,
-    least,
-    pair_least,
-    lead,
-    agreement,
-    result,
-):
+def sweep(sweep_images, transfers, points, bounds, focal, radius, step, tilt, tilts, limits, result):
     """Find the best plane of every point (N, 2) on its ray, between inverse depths `bounds` (N, 2).
 
+    `sweep_images` are the arrays of `SweepImages`, `limits` the least correlation of all images, that of one alone, the
+    lead over other places, and how far images may disagree, pixels.
     `result` (N, 5) receives the number of a reason in `seeds.REASONS`, the plane, and its correlation.
     """
+    flat, seen, shapes, starts = sweep_images
+    least, pair_least, lead, agreement = limits
     images = len(transfers)
     side = 2 * tilts + 1
     for s in prange(len(points)):

@@ -99,10 +99,7 @@ def find_seeds(
     bounds = np.column_stack([1 / depth.far[rows, columns], 1 / depth.near[rows, columns]]).astype(np.float64)
     result = np.zeros((len(points.pixels), 5))
     sweep(
-        smooth.flat,
-        smooth.seen,
-        smooth.shapes,
-        smooth.starts,
+        (smooth.flat, smooth.seen, smooth.shapes, smooth.starts),
         transfers,
         points.pixels - 0.5,
         bounds,
@@ -111,10 +108,7 @@ def find_seeds(
         settings.step,
         settings.tilt,
         settings.tilts,
-        settings.correlation,
-        settings.pair_correlation,
-        settings.uniqueness,
-        settings.agreement,
+        (settings.correlation, settings.pair_correlation, settings.uniqueness, settings.agreement),
         result,
     )
     status = result[:, 0].astype(int)

@@ -28,7 +28,7 @@ from geomocap.naming.tree_matching import (
 LIKELY = 0.7  # a name is given
 CERTAIN = 0.9  # left and right are told
 AUTOMATIC = ("human", "quadruped", "bird")  # a hand may lie anyhow; with few joints most trees would fit it
-FITS = 0.5  # share of a perfect subject's score that a tree must have for each of its joints
+FITS = 0.5  # fraction of a perfect subject's score that a tree must have for each of its joints
 FAR = 3.0  # standard deviations within which a body lies
 MOST_WORDS = 3  # of parts in one body's name
 
@@ -166,10 +166,10 @@ def _names(posture: MeanPosture, template: NameTemplate, ways: list[TreeMatch], 
             joint_parts[j], joint_confidence[j] = part
             joints[j] = _with_side(template.joints[part[0]], template.sides[part[0]], known=sides_known)
     names, confidence = {}, {}
-    for body, (parts, share) in bodies.items():
+    for body, (parts, fraction) in bodies.items():
         name = _name(parts, template, sides_known=sides_known)
         if name is not None:
-            names[body], confidence[body] = name, share
+            names[body], confidence[body] = name, fraction
     return FoundNames(
         template=template,
         bodies=_numbered(names, posture.tree.surfaces),

@@ -103,7 +103,7 @@ def _heading(bodies: np.ndarray, way: np.ndarray | None) -> np.ndarray:
 
 
 def _lengths(skeleton: Skeleton, surface: BodySurface | None) -> tuple[np.ndarray, np.ndarray]:
-    """From each joint to the farthest points of its bodies, (B, J), and the bodies' shares of the surface, (B,)."""
+    """From each joint to the farthest points of its bodies, (B, J), and the bodies' fractions of the surface, (B,)."""
     pairs = skeleton.joint_bodies
     lengths = np.full((skeleton.body_count, len(pairs)), np.nan)
     centers, joints = _filled(skeleton.body_positions)[0], _filled(skeleton.joint_positions)[0]
@@ -115,11 +115,11 @@ def _lengths(skeleton: Skeleton, surface: BodySurface | None) -> tuple[np.ndarra
             else:
                 lengths[body, j] = 2 * np.linalg.norm(centers[body] - joints[j])
     if surface is not None:
-        shares = np.bincount(surface.bodies, minlength=skeleton.body_count).astype(float)
+        fractions = np.bincount(surface.bodies, minlength=skeleton.body_count).astype(float)
     else:
-        shares = np.nanmax(lengths, axis=1)
-    shares = np.maximum(shares, max(1e-3 * shares.sum(), 1e-12))
-    return lengths, shares / shares.sum()
+        fractions = np.nanmax(lengths, axis=1)
+    fractions = np.maximum(fractions, max(1e-3 * fractions.sum(), 1e-12))
+    return lengths, fractions / fractions.sum()
 
 
 def _about_up(angles: np.ndarray) -> np.ndarray:

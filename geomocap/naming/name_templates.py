@@ -7,7 +7,7 @@ joint_name = "back"            # what the joint to the parent is called
 joint = [0.0, 0.0, 0.63]       # its place: forward, left, up; any unit
 center = [0.0, 0.0, 0.73]      # of the part's surface
 tip = [0.0, 0.0, 1.0]          # farthest point of a part at the end of a limb
-surface = 18                   # its share of the surface; any unit
+surface = 18                   # its fraction of the surface; any unit
 mobility = 0.3                 # how far it usually turns in its joint, radians
 pair = true                    # there are two, written down for the left one
 [groups]                       # what several parts in one body are called

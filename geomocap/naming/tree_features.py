@@ -38,7 +38,7 @@ class PosedTree:
 
 @dataclass(frozen=True)
 class JointFeatures:
-    """Features of V ways to look at joints. Lengths are in shares of the longest way through the tree.
+    """Features of V ways to look at joints. Lengths are in fractions of the longest way through the tree.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class JointFeatures:
     beyond : (V, B) bool
         Bodies beyond the joint.
     surface, reach : (V,) float
-        Logarithms of the share of the surface beyond, and of the longest way from the joint through the tree there.
+        Logarithms of the fraction of the surface beyond, and of the longest way from the joint through the tree there.
     place, center : (V, 3) float
         Of the joint, from the centre of the surface; of what is beyond, from the joint.
     diameter : float
@@ -77,13 +77,13 @@ def joint_features(tree: PosedTree, *, both_ways: bool) -> JointFeatures:
     joint = np.tile(np.arange(len(pairs)), 2 if both_ways else 1)
     reach = np.concatenate([reach[:, 0], reach[:, 1]]) if both_ways else reach[:, 0]
     weights = beyond * tree.surfaces
-    share = weights.sum(axis=1)
+    fraction = weights.sum(axis=1)
     middle = tree.surfaces @ tree.centers / tree.surfaces.sum()
-    center = (weights @ tree.centers) / np.maximum(share, 1e-12)[:, None] - tree.joints[joint]
+    center = (weights @ tree.centers) / np.maximum(fraction, 1e-12)[:, None] - tree.joints[joint]
     return JointFeatures(
         joint,
         beyond,
-        np.log(np.maximum(share, 1e-6)),
+        np.log(np.maximum(fraction, 1e-6)),
         np.log(np.maximum(reach / diameter, 1e-6)),
         (tree.joints[joint] - middle) / diameter,
         center / diameter,

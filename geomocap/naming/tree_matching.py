@@ -20,11 +20,11 @@ from geomocap.naming.name_templates import NameTemplate
 from geomocap.naming.tree_features import JointFeatures, PosedTree, joint_features
 
 HEADINGS = 16  # directions in which a subject may face, of which the best is taken
-PLACE = 0.05  # how far subjects differ from a template, in shares of its longest way; standard deviation
+PLACE = 0.05  # how far subjects differ from a template, in fractions of its longest way; standard deviation
 SURFACE, REACH = 0.5, 0.25  # the same of logarithms
 LATERAL = 0.5  # of that to the sides: mean postures are nearly symmetric
 DEPENDENT = 0.5  # features of a joint overlap: their weight together
-ALIKE = 0.5  # share of what a subject's left differs from a template in that its right has, too (variances)
+ALIKE = 0.5  # fraction of what a subject's left differs from a template in that its right has, too (variances)
 SURE = 5.0  # log odds beyond which nobody asks
 TURNED = 4.0  # log odds of a motion that shows the heading clearly
 _TILTS = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])  # quarter turns
@@ -186,7 +186,7 @@ def perfect_gain(template: NameTemplate) -> float:
 def part_places(template: NameTemplate) -> tuple[np.ndarray, np.ndarray]:
     """Centres of a template's parts, (K, 3), from the middle of all, and how far they stray, (K, 3).
 
-    In shares of the longest way through the tree: forward, left and up.
+    In fractions of the longest way through the tree: forward, left and up.
 
     Parameters
     ----------

@@ -18,6 +18,7 @@ from geomocap.files.capture import Capture
 from geomocap.files.corrected_cameras import CORRECTION, SPARSE_FILES, as_seen, write_cameras
 from geomocap.files.run import stage_key
 from geomocap.model.camera_correction import CameraCorrection
+from geomocap.model.even_choice import evenly_chosen
 from geomocap.pipeline.job import Job
 from geomocap.scheduling import map_items
 from geomocap.silhouettes.background import BackgroundModel, model_from_frames, model_from_plate
@@ -64,7 +65,7 @@ def find_correction(job: Job, capture: Capture) -> CameraCorrection:
     if not (capture.has_masks or plates or capture.n_recorded >= BACKGROUND_FRAMES):
         return CameraCorrection(rig, rig, np.nan, np.nan)  # there are no silhouettes
     shrink = 1 if capture.has_masks else max(1, round(int(rig.sizes.max()) / LONGEST))
-    chosen = np.unique(np.linspace(0, capture.n_frames - 1, min(OUTLINES, capture.n_frames)).round().astype(int))
+    chosen = evenly_chosen(capture.n_frames, OUTLINES)
     if capture.has_masks:
         masks = [tuple(capture.mask(c, int(k)) for c in capture.cameras) for k in chosen]
     else:
@@ -114,8 +115,7 @@ class LearnBackground:
     def __call__(self, camera: str) -> BackgroundModel:
         """Learn it from frames spread over the recording."""
         recorded = self.capture.sources[camera]  # also the frames before the subject came in
-        count = min(self.settings.samples, len(recorded))
-        chosen = np.unique(np.linspace(0, len(recorded) - 1, count).round().astype(int))
+        chosen = evenly_chosen(len(recorded), self.settings.samples)
         frames = [_reduced(recorded.read(int(k)), self.shrink) for k in chosen]
         if not self.capture.has_background(camera):
             return model_from_frames(frames, self.settings, camera)

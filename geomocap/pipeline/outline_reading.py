@@ -7,6 +7,7 @@ import numpy as np
 from geomocap.carving.silhouette_views import Undistortion
 from geomocap.files.corrected_cameras import as_seen
 from geomocap.files.results import read_silhouette
+from geomocap.model.even_choice import evenly_chosen
 from geomocap.model.outlines import Outlines
 from geomocap.pipeline.job import Job
 
@@ -20,7 +21,7 @@ def outlines_of(job: Job) -> Outlines | None:
         return None
     capture = as_seen(job.run, job.capture)
     undistortion = Undistortion.of(capture.rig)
-    frames = np.unique(np.linspace(0, capture.n_frames - 1, min(_FRAMES, capture.n_frames)).round().astype(int))
+    frames = evenly_chosen(capture.n_frames, _FRAMES)
     height, width = undistortion.valid.shape[1:]
     factor = max(1, round(max(height, width) / _LONGEST_SIDE))
     seen = _blocks(undistortion.valid, factor).min(axis=(2, 4))

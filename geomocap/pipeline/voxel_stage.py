@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
 from geomocap.carving.agreement import check_cameras, check_silhouettes
 from geomocap.carving.carving_settings import CarvingSettings
 from geomocap.carving.frames import carve_frame, needs_images
@@ -17,6 +15,7 @@ from geomocap.errors import CaptureError
 from geomocap.files.capture import Capture
 from geomocap.files.results import read_silhouette, write_voxels
 from geomocap.files.run import Run, stage_key
+from geomocap.model.even_choice import evenly_chosen
 from geomocap.pipeline.correction_stage import with_cameras
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.silhouette_stage import silhouettes
@@ -52,8 +51,7 @@ def _carve_all(job: Job, capture: Capture, settings: CarvingSettings) -> int:
     undistortion = Undistortion.of(capture.rig)
     task = _Carve(capture, job.run, settings, undistortion, None)
     check_cameras(task.views(0).everything(), settings.hull)
-    count = min(VOLUME_FRAMES, capture.n_frames)
-    sample = np.unique(np.linspace(0, capture.n_frames - 1, count).round().astype(int)).tolist()
+    sample = evenly_chosen(capture.n_frames, VOLUME_FRAMES).tolist()
     grid = working_volume(_reported(job, task, sample), settings, sample)
     sound = job.run.sound("voxels")
     missing = [k for k in range(capture.n_frames) if job.run.frame_file("voxels", k) not in sound]

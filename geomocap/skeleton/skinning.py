@@ -1,4 +1,4 @@
-"""Skin weights from motion: which bodies a point follows, and by which shares (linear blend skinning)."""
+"""Skin weights from motion: which bodies a point follows, and by which fractions (linear blend skinning)."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.errors import GeometryError
+from geomocap.model.even_choice import evenly_chosen
 from geomocap.model.surface import outward_normals
 from geomocap.skeleton.body_observations import INFLUENCES, SkinPoints
 from geomocap.skeleton.kinematics import BodyMotion
@@ -72,7 +73,7 @@ def build_model(
     """
     skeleton = found.skeleton
     frames = len(bodies.rotations)
-    chosen = np.unique(np.linspace(0, frames - 1, min(FRAMES, frames)).round().astype(int))
+    chosen = evenly_chosen(frames, FRAMES)
     motion = BodyMotion(bodies.rotations, bodies.translations)
     points, normals, colors, body = _agreed_surface([read(int(t)) for t in chosen], chosen, motion, spacing)
     if len(points) < _LEAST_POINTS:

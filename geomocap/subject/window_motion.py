@@ -41,18 +41,18 @@ def joined_motion(linkage: Linkage, windows: Sequence[range], motions: Sequence[
     carried = np.zeros((count, linkage.body_count, 3))
     weight = np.zeros(count)
     for k, (window, motion) in enumerate(zip(windows, motions, strict=True)):
-        share = np.ones(len(window))
+        fraction = np.ones(len(window))
         if k > 0:
             shared = windows[k - 1].stop - window.start
-            share[:shared] = np.arange(1, shared + 1) / (shared + 1)
+            fraction[:shared] = np.arange(1, shared + 1) / (shared + 1)
         if k + 1 < len(windows):
             shared = window.stop - windows[k + 1].start
-            share[len(share) - shared :] = np.arange(shared, 0, -1) / (shared + 1)
+            fraction[len(fraction) - shared :] = np.arange(shared, 0, -1) / (shared + 1)
         frames = slice(window.start, window.stop)
-        rotations[frames] += share[:, None, None, None] * motion.rotations
+        rotations[frames] += fraction[:, None, None, None] * motion.rotations
         moved = np.einsum("tbij,bj->tbi", motion.rotations, places) + motion.translations
-        carried[frames] += share[:, None, None] * moved
-        weight[frames] += share
+        carried[frames] += fraction[:, None, None] * moved
+        weight[frames] += fraction
     turned = nearest_rotation(rotations)
     carried /= weight[:, None, None]
     return BodyMotion(turned, carried - np.einsum("tbij,bj->tbi", turned, places))

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
+from geomocap.model.even_choice import evenly_chosen
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.scheduling import spread
 
@@ -36,7 +37,7 @@ def nearest_companions(
     lengths = seen.sum(axis=1)
     long = lengths >= np.median(lengths)
     rows_list, columns_list = [], []
-    for t in np.unique(np.linspace(0, frames - 1, 20).round().astype(int)):
+    for t in evenly_chosen(frames, 20):
         alive = np.flatnonzero(seen[:, t])
         for others in (alive, alive[long[alive]])[: 1 + across_gaps]:
             near = min(_CANDIDATES + 1, len(others))
