@@ -16,7 +16,6 @@ from viz.figures import plot
 from viz.report import Block, Report, Section, table, text, write_report
 from viz.report import plot as plot_block
 
-GRADE_WORDS = {"good": "good", "usable": "usable", "poor": "poor"}
 UP_COLUMNS = {"x": (1, 2, 0), "y": (2, 0, 1), "z": (0, 1, 2)}
 
 
@@ -55,73 +54,54 @@ def report_of(calibration: Calibration, plots: dict[str, bytes]) -> Report:
         verdict.append(Block("warnings", items=c.verdict.warnings))
     else:
         verdict.append(Block("fine", "Nothing needs recording again."))
+    precision = (
+        text(
+            f"Standard deviations are for the a-posteriori sigma0 of {c.sigma0:.2f} and a free network whose "
+            f"datum is held by all bar ends. A bar end is known to "
+            f"{1000 * c.covariance.point_sigma:.3f} mm in each axis."
+        ),
+        interior_table(c),
+        pose_table(c),
+        distortion_table(c),
+        *tests_block(c),
+    )
+
+    def pictured(title: str, name: str, caption: str, words: str) -> Section:
+        return Section(title, name, (plot_block(plots[name], caption, words),))
+
     sections = (
         Section("Verdict", "verdict", tuple(verdict)),
-        Section(
+        pictured(
             "Cameras and bar",
             "layout",
-            (
-                plot_block(
-                    plots["layout"],
-                    "Where the cameras stand and where the bar was held",
-                    f"{len(n.bars)} bar positions, coloured by frame. World from {c.datum.source}.",
-                ),
-            ),
+            "Where the cameras stand and where the bar was held",
+            f"{len(n.bars)} bar positions, coloured by frame. World from {c.datum.source}.",
         ),
-        Section(
-            "Precision",
-            "precision",
-            (
-                text(
-                    f"Standard deviations are for the a-posteriori sigma0 of {c.sigma0:.2f} and a free network whose "
-                    f"datum is held by all bar ends. A bar end is known to "
-                    f"{1000 * c.covariance.point_sigma:.3f} mm in each axis."
-                ),
-                interior_table(c),
-                pose_table(c),
-                distortion_table(c),
-                *tests_block(c),
-            ),
-        ),
-        Section(
+        Section("Precision", "precision", precision),
+        pictured(
             "Residuals",
             "residuals",
-            (
-                plot_block(
-                    plots["residuals"],
-                    "Residuals over each image",
-                    "Computed minus observed positions of the bar ends, enlarged as the scale bar says. Directions "
-                    "that agree in some part of an image show a distortion that the model does not have.",
-                ),
-            ),
+            "Residuals over each image",
+            "Computed minus observed positions of the bar ends, enlarged as the scale bar says. Directions that agree "
+            "in some part of an image show a distortion that the model does not have.",
         ),
-        Section(
+        pictured(
             "Coverage",
             "coverage",
-            (
-                plot_block(
-                    plots["coverage"],
-                    "Where in each image the bar was seen",
-                    "Number of bar ends in each field. Distortion is extrapolated where there are none.",
-                ),
-            ),
+            "Where in each image the bar was seen",
+            "Number of bar ends in each field. Distortion is extrapolated where there are none.",
         ),
-        Section(
+        pictured(
             "Held-out bars",
             "lengths",
-            (
-                plot_block(
-                    plots["lengths"],
-                    "Lengths of bars that the cameras were not calibrated with",
-                    "The calibration was repeated without a part of the bars, and these were then measured by forward "
-                    "intersection alone.",
-                ),
-            ),
+            "Lengths of bars that the cameras were not calibrated with",
+            "The calibration was repeated without a part of the bars, and these were then measured by forward "
+            "intersection alone.",
         ),
     )
     relative = c.held_out.relative
     figures = (
-        ("verdict", GRADE_WORDS[c.verdict.grade]),
+        ("verdict", c.verdict.grade),
         ("held-out length error, RMS", f"{1000 * c.held_out.rms:.2f} mm"),
         ("of the volume", f"1/{1 / relative:.0f}" if relative > 0 else "–"),
         ("residual, RMS", f"{np.sqrt(np.mean(c.adjusted.residuals**2)):.3f} px"),

@@ -14,7 +14,7 @@ from geomocap.files.frame_files import read_points
 from geomocap.files.geometry_claims import check_geometry
 from geomocap.files.open3d_geometry import read_by_open3d
 from geomocap.files.scan_checks import check_points
-from geomocap.files.scan_geometry import read_mesh
+from geomocap.files.scan_geometry import CLOUD_ENDINGS, MESH_ENDINGS, read_mesh
 from geomocap.model.surface import vertex_normals
 from geomocap.reading import open_plain
 from viz.body_colors import body_colors
@@ -26,8 +26,6 @@ from viz.sheets import FINE, VIEWS, tile_size
 from viz.viewpoints import stage_of, up_vector
 from viz.volumes import cubes, gems, spacing
 
-MESHES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
-CLOUDS = (".ply", ".pcd", ".xyz", ".pts")
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
 
@@ -45,8 +43,8 @@ def load(path: Path) -> Mesh:
     ending = path.suffix.lower()
     if not path.is_file():
         raise GeometryError(f"{path}: no such file")
-    if ending not in {*MESHES, *CLOUDS}:
-        raise GeometryError(f"{path}: can't be shown; expected {', '.join(sorted({*MESHES, *CLOUDS}))}")
+    if ending not in {*MESH_ENDINGS, *CLOUD_ENDINGS}:
+        raise GeometryError(f"{path}: can't be shown; expected {', '.join(sorted({*MESH_ENDINGS, *CLOUD_ENDINGS}))}")
     check_geometry(path)
     if ending == ".ply" and _is_voxel_grid(path):
         grid = read_by_open3d(o3d.io.read_voxel_grid, path)
@@ -56,11 +54,11 @@ def load(path: Path) -> Mesh:
         indices = np.array([v.grid_index for v in voxels]).reshape(-1, 3)
         colors = np.array([v.color for v in voxels]).reshape(-1, 3) * 255
         return cubes(indices, np.asarray(grid.origin), grid.voxel_size, colors)
-    if ending in MESHES:
+    if ending in MESH_ENDINGS:
         found = read_mesh(path)
         if found is not None:
             return _triangles(found, path)
-    if ending not in CLOUDS:
+    if ending not in CLOUD_ENDINGS:
         raise GeometryError(f"{path}: holds no triangles; is it truncated?")
     try:
         points = read_points(path).finite

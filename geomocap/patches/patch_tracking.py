@@ -18,8 +18,9 @@ from geomocap.patches.patch_search import Followed, carry_lost, hiding_depth, ju
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.patches.reacquisition import reacquire
 from geomocap.patches.seeding import patch_radii, seed_for_one_camera, seed_patches, seed_spacing
-from geomocap.patches.surface_patches import SAME_SIDE, PatchAlignment, Patches, TemplateStore, doubted, with_templates
+from geomocap.patches.surface_patches import SAME_SIDE, PatchAlignment, Patches, doubted, with_templates
 from geomocap.patches.swings import find_pieces, lost_pieces
+from geomocap.patches.template_store import TemplateStore
 from geomocap.patches.track_record import TrackRecord
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from geomocap.model.rotations import rigid_motion
 from geomocap.patches.frame_views import FrameViews
+from geomocap.patches.piece_textures import ANGLES, best_matches, likenesses, patch_radius, textures_of
 from geomocap.patches.seeding import patch_shape, spread, surface_frames
 from geomocap.patches.surface_patches import (
     FACING_OTHERS,
@@ -36,9 +37,6 @@ _MOST_PLACES = 10_000  # if there are not more than about so many
 _HULL_VOXELS = 2.0  # a place may lie so far behind the drawn surface
 _MATCHED, _TRIED = 128, 32  # patches of a piece whose textures are looked for; that stand for it
 _PART = 0.6  # fraction of them that must fit: the piece may have been two
-_ANGLES = 24  # in which textures are compared
-_PROMISING = 0.6  # least correlation of textures,
-_MATCHES, _MATCHES_OF_ANGLE = 100_000, 20_000  # and most pairs of them
 _INSIDE = 0.6  # fraction of the patches that must lie in the silhouettes
 _BESIDE = 1.5  # spacings; a patch is compared with places so near to it
 _CELL = 0.5  # edge of the cells in which these are looked up, spacings
@@ -75,7 +73,7 @@ def free_places(taken: np.ndarray, patches: Patches, view: FrameViews, spacing: 
     points = free[spread(free, distance, np.zeros((0, 3)), np.random.default_rng(0))]
     positions, frames, curvature = surface_frames(view, points)
     size = np.full(len(positions), np.median(patches.size))
-    blank = Patches.without_templates(positions, frames, patch_shape(curvature, size, _radius(M)), size, C, L)
+    blank = Patches.without_templates(positions, frames, patch_shape(curvature, size, patch_radius(M)), size, C, L)
     slack = np.full((len(points), 1), _HULL_VOXELS * view.voxel_size)
     seen = visible(positions, frames, blank.hidden, view, slack, FACING_OTHERS)
     best = np.where(seen, facings(positions, blank.normals, view), -2).argmax(axis=1)
@@ -168,9 +166,9 @@ def _promising(
     piece: Patches, some: np.ndarray, places: Patches, view: FrameViews, spacing: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Turns (K, 3, 3) and shifts (K, 3) that put the patches `some` (m,) next to places that look like them."""
-    alike = _likenesses(_textures(piece), _textures(places))
-    k, i, j = _best_matches(alike)
-    angle = 2 * np.pi * k / _ANGLES
+    alike = likenesses(textures_of(piece), textures_of(places))
+    k, i, j = best_matches(alike)
+    angle = 2 * np.pi * k / ANGLES
     c, s, o, e = np.cos(angle), np.sin(angle), np.zeros(len(k)), np.ones(len(k))
     in_plane = np.stack([c, -s, o, s, c, o, o, o, e], axis=1).reshape(-1, 3, 3)
     turns = places.frames[j] @ in_plane @ piece.frames[i].swapaxes(1, 2)
@@ -302,64 +300,10 @@ def _beside(
     near = np.where(there, near, 0)
     between = places.frames[near].swapaxes(3, 4) @ turned[:, :, None]
     angle = np.arctan2(between[..., 1, 0] - between[..., 0, 1], between[..., 0, 0] + between[..., 1, 1])
-    k = np.rint(angle * _ANGLES / (2 * np.pi)).astype(int) % _ANGLES
+    k = np.rint(angle * ANGLES / (2 * np.pi)).astype(int) % ANGLES
     value = np.where(there, np.maximum(alike[k, np.arange(m)[:, None], near], 0.0), 0.0)
     best = value.argmax(axis=2)[:, :, None]
     return np.take_along_axis(value, best, 2)[:, :, 0], np.take_along_axis(near, best, 2)[:, :, 0]
-
-
-def _textures(patches: Patches) -> np.ndarray:
-    """Blurred textures (N, M) of patches as the first camera with a template saw them; its mean where it saw none."""
-    camera = patches.has.argmax(axis=1)
-    texture = patches.store.templates[patches.rows, camera, 0, :, 0].astype(float)
-    usable = patches.store.usable[patches.rows, camera] != 0
-    middle = (texture * usable).sum(axis=1) / np.maximum(usable.sum(axis=1), 1)
-    return np.where(usable, texture, middle[:, None])
-
-
-def _likenesses(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Correlations (A, N, P) of textures (N, M), turned by A angles, with textures (P, M), within the inner disc."""
-    radius = _radius(first.shape[1])
-    still = _normalised(second @ _turning(radius, 0.0).T).T
-    angles = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
-    alike = np.empty((_ANGLES, len(first), len(second)), np.float32)
-    for k, angle in enumerate(angles):
-        np.matmul(_normalised(first @ _turning(radius, angle).T), still, out=alike[k])
-    return alike
-
-
-def _best_matches(alike: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Angles, patches and places of the highest correlations in `alike` (A, n, P): not more than `_MATCHES`."""
-    kept = []
-    for n, of_angle in enumerate(alike):
-        flat = of_angle.ravel()
-        best = np.flatnonzero(flat > _PROMISING)
-        if len(best) > _MATCHES_OF_ANGLE:
-            best = best[np.argpartition(-flat[best], _MATCHES_OF_ANGLE)[:_MATCHES_OF_ANGLE]]
-        kept.append(n * of_angle.size + np.sort(best))
-    best = np.concatenate(kept)
-    if len(best) > _MATCHES:
-        best = np.sort(best[np.argpartition(-alike.ravel()[best], _MATCHES)[:_MATCHES]])
-    k, i, j = np.unravel_index(best, alike.shape)
-    return k, i, j
-
-
-def _turning(radius: int, angle: float) -> np.ndarray:
-    """Weights (n, M) of the M samples of a square for the n of its inner disc once the texture has turned."""
-    s, t = (g.ravel() for g in np.meshgrid(*[np.arange(-radius, radius + 1)] * 2))
-    disc = s**2 + t**2 <= radius**2
-    x = np.cos(angle) * s[disc] + np.sin(angle) * t[disc]
-    y = np.cos(angle) * t[disc] - np.sin(angle) * s[disc]
-    return np.maximum(1 - np.abs(x[:, None] - s), 0) * np.maximum(1 - np.abs(y[:, None] - t), 0)
-
-
-def _normalised(textures: np.ndarray) -> np.ndarray:
-    centred = (textures - textures.mean(axis=1, keepdims=True)).astype(np.float32)
-    return centred / np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1e-6)
-
-
-def _radius(samples: int) -> int:
-    return (round(samples**0.5) - 1) // 2
 
 
 def rigid_motions(
