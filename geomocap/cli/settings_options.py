@@ -101,9 +101,10 @@ def _with_options(
         example = "TABLE.KEY" if all("." in key for key in fields) else "KEY"
         set_help = "Set any key of the settings file; may be repeated. docs/settings.md lists them all."
         one = Annotated[list[str] | None, typer.Option("--set", metavar=f"{example}=VALUE", help=set_help)]
-        parameters = [p for p in signature.parameters.values() if p.name not in (name, "where")]
-        runs = list(inspect.signature(Where, eval_str=True).parameters.values()) * ("where" in signature.parameters)
-        parameters += [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in runs]
+        where = [p.name for p in signature.parameters.values() if p.annotation is Where]
+        runs = inspect.signature(Where, eval_str=True).parameters if where else {}
+        parameters = [p for p in signature.parameters.values() if p.name not in (name, *where)]
+        parameters += [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in runs.values()]
         parameters += [_parameter("config_file", file), _parameter("set_values", one)]
         parameters += [_parameter(f"{_FLAG}{n}", _option(k, flags[k], fields[k])) for n, k in enumerate(flags)]
 
@@ -111,9 +112,9 @@ def _with_options(
         def wrapper(**arguments: Any) -> None:
             values = _nested(arguments.pop("set_values") or (), fields)
             file = arguments.pop("config_file")
-            where = {"where": Where(**{p.name: arguments.pop(p.name) for p in runs})} if runs else {}
+            work = Where(**{n: arguments.pop(n) for n in runs})
             given = {n: v for n, v in arguments.items() if not n.startswith(_FLAG)}
-            command(**given, **where, **{name: build(file, values)})
+            command(**given, **dict.fromkeys(where, work), **{name: build(file, values)})
 
         wrapper.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
         wrapper.__annotations__ = {p.name: p.annotation for p in parameters}
