@@ -1,7 +1,7 @@
 """Matching many points of one template image, each from the plane expected there; compiled.
 
 What a point hands to its neighbours is a plane: inverse depth μ and its slope in the template image. The start of the
-neighbour in every search image, position and affine matrix, follows from it (`epipolar.plane_affine`), also in images
+neighbour in every search image, position and affine matrix, follows from it (`plane_start`), also in images
 in which the point itself was not seen.
 """
 

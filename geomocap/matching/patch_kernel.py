@@ -16,18 +16,9 @@ from geomocap.matching.patch_covariance import covariance
 from geomocap.matching.patch_sums import normal_equations, sample_and_project, sample_template, template_mask
 from geomocap.model.small_systems import cholesky, solve
 
-MATCHED = 0
-OUTSIDE_TEMPLATE = 1
-LOW_TEXTURE = 2
-OUTSIDE_SEARCH = 3
-NOT_CONVERGED = 4
-DEGENERATE = 5
-CORRELATION = 6
-SIGMA = 7
-PRECISION = 8
-SHIFT = 9
-EPIPOLAR = 10
-UNTRIED = 11
+# What became of a point, in the order of `lsm.REASONS`
+MATCHED, OUTSIDE_TEMPLATE, LOW_TEXTURE, OUTSIDE_SEARCH, NOT_CONVERGED, DEGENERATE = range(6)
+CORRELATION, SIGMA, PRECISION, SHIFT, EPIPOLAR, UNTRIED = range(6, 12)
 
 STATUS, CORR, ITERATIONS, SIGMA0, CXX, CXY, CYY, GAIN, OFFSET, EPI, INVERSE_DEPTH, COLUMNS = range(12)
 

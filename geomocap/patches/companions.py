@@ -13,10 +13,10 @@ import numpy as np
 
 from geomocap.patches.patch_prediction import nearest
 
-_COUNT = 12
+_COUNT = 12  # companions of a patch
 _ENOUGH = 3  # companions whose places must be known
 _RINGS = 8  # of lost patches, each one placed by those before
-_ROUNDS = 5
+_ROUNDS = 5  # in which patches that too few companions bear out are left out
 _AHEAD = 1.5  # frames; what another motion would do in them counts as distance
 
 

@@ -15,8 +15,8 @@ from geomocap.carving.voxel_grid import Grid
 from geomocap.errors import GeometryError
 from geomocap.model.frame_geometry import Voxels
 
-_ALL_FACES = 63
-_MARGIN_PX = 2
+_ALL_FACES = 63  # of a voxel: one bit each
+_MARGIN_PX = 2  # pixels by which silhouettes are widened
 _WIDE = 3.0  # blurs; the mean over that is taken away
 _EMPTY = 1e-3  # fraction of subject under the blur below which a pixel has no value
 

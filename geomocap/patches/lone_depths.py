@@ -19,8 +19,8 @@ from geomocap.model.rotations import nearest_rotation
 from geomocap.model.trajectories import Trajectories
 from geomocap.trajectories.completion import nearest_companions
 
-_COMPANIONS = 12
-_ROUNDS = 6
+_COMPANIONS = 12  # of a patch
+_ROUNDS = 6  # of turns, depths and shapes
 _LOOSE = 1 / 3  # distance at which companions count half, in standard deviations of the depths
 _KEEPS = 1 / 6  # standard deviation of the shape that companions keep, in the same
 _FRACTION = 2.0  # weight of all companions together

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from geomocap.patches.frame_views import FrameViews
 
-_FLOW_WINDOW = (13, 13)
-_FLOW_LEVELS = 3
+_FLOW_WINDOW = (13, 13)  # pixels
+_FLOW_LEVELS = 3  # of the pyramid
 _CONTRAST = 3.0  # bytes a grey level
 _FLOW_SIGMA = 1.5  # px; residual from which a camera's flow counts less
 _WEAK = 0.3  # m; a shift that no camera sees is taken as zero with this standard deviation

@@ -16,18 +16,18 @@ from geomocap.patches.surface_patches import PatchAlignment, Patches, align, fac
 from geomocap.patches.swings import LostPiece
 
 _FACING = 0.25  # cosine from which a camera is asked
-_NEW_TEMPLATE_FACING = 0.5
-_NEW_TEMPLATE_CORRELATION = 0.9
+_NEW_TEMPLATE_FACING = 0.5  # cosine from which a camera's first template of a patch is taken,
+_NEW_TEMPLATE_CORRELATION = 0.9  # correlation from which, and below which an updated one is taken again
 _SURE = 0.9  # correlation from which no second start is tried
 _SURE_START = 0.95  # correlation of the blurred images from which optical flow isn't needed
-_NEIGHBOURS = 8
+_NEIGHBOURS = 8  # whose motion is tried, and compared
 _ALONE = 2.0  # times the standard deviation that is allowed where a single camera sees a patch
-_ROUGH = 2 / 3
+_ROUGH = 2 / 3  # part of a difference along a lone camera's ray that doesn't count
 _AGREEING = 3  # neighbours whose motion a patch must share
-_SLACK_VOXELS = 2.0
+_SLACK_VOXELS = 2.0  # of the hull that hide nothing
 _ITERATIONS = (6, 10)  # on the coarse and the fine level
 _PATIENCE = 5  # frames for which a lost patch is looked for in each; later in every fourth
-_SELDOM = 4
+_SELDOM = 4  # frames between two looks after that
 
 
 @dataclass(frozen=True)

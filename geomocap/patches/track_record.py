@@ -10,7 +10,7 @@ from geomocap.model.trajectories import LAST_FRAME, Trajectories
 from geomocap.patches.one_camera import DEPTH_PX
 from geomocap.patches.surface_patches import PatchAlignment, Patches
 
-_PLACED_PX = 0.1
+_PLACED_PX = 0.1  # standard deviation of a patch where it is placed, pixels
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ _FEW = 4  # frames that are not worth waking the other threads for
 _CHUNK = 64  # frames whose blocks are in memory at once
 _LEAST_DAMPING = 1e-6
 _MOST_DAMPING = 1e6
-_LONGEST_TURN = 0.5
+_LONGEST_TURN = 0.5  # radians, in one step
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import DEPTH_FRACTION
 
 INFLUENCES = 4  # bodies that may move a point, at most
-LEAST_FRACTION = 0.01
+LEAST_FRACTION = 0.01  # of a point; what follows a body less does not follow it
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ from scipy.spatial import cKDTree
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.bodies.surface_graph import frames_looked_at
 
-_NEAREST = 6
-_FRAMES = 10
+_NEAREST = 6  # samples of a body that are on the border in any case
+_FRAMES = 10  # looked at
 _NEAR = 1.5  # spacings of the samples
 _BESIDE = 0.75  # of the narrower body
 _SHORT = 2.0 / 3.0  # of its radius
-_OUTLIERS = 0.02
+_OUTLIERS = 0.02  # fraction of the places that reach farther
 
 
 @dataclass(frozen=True)
