@@ -27,18 +27,19 @@ def count_contacts(points: np.ndarray, labels: np.ndarray, count: int) -> np.nda
     (K, K) int32
         Symmetric; zero on the diagonal.
     """
-    if not len(points):
+    known = labels >= 0
+    if not known.any():
         return np.zeros((count, count), np.int32)
     # one empty layer around, so that a neighbour's key never wraps into the next row
     cells = np.floor(points - points.min(axis=0) + 0.5).astype(np.int64) + 1
     shape = cells.max(axis=0) + 2
-    known = labels >= 0
-    keys, cell = np.unique(np.ravel_multi_index(tuple(cells[known].T), tuple(shape)), return_inverse=True)
+    strides = np.array([shape[1] * shape[2], shape[2], 1])
+    keys, cell = np.unique(cells[known] @ strides, return_inverse=True)
     held = csr_matrix((np.ones(len(cell), np.int32), (cell, labels[known])), shape=(len(keys), count))
     contacts = (held.T @ held).toarray()
-    for x, y, z in product((0, 1), (-1, 0, 1), (-1, 0, 1)):
-        if (x, y, z) > (0, 0, 0):  # each two cells once
-            step = (x * shape[1] + y) * shape[2] + z
+    for way in product((0, 1), (-1, 0, 1), (-1, 0, 1)):
+        if way > (0, 0, 0):  # each two cells once
+            step = way @ strides
             beside = np.searchsorted(keys, keys + step) % len(keys)
             one = np.flatnonzero(keys[beside] == keys + step)
             between = (held[one].T @ held[beside[one]]).toarray()
