@@ -104,6 +104,7 @@ def test_contacts_agree_with_all_pairs(spread):
 def test_contacts_do_not_wrap_around_the_grid():
     points = np.array([[0.0, 0, 0], [0, 0, 9], [0, 1, 0], [1, 0, 9]])
     contacts = count_contacts(points, np.arange(4), 4)
+    assert not count_contacts(points, np.full(4, -1), 4).any()
     assert contacts.sum() == 4  # 0 with 2 (next in y) and 1 with 3 (next in x), both ways
     assert contacts[0, 2] == contacts[1, 3] == 1
 
