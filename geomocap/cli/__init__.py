@@ -14,6 +14,7 @@ GARBAGE = 100_000  # objects made before those not needed are looked for: compil
 def main() -> None:
     """Run the command line; a mistake of the user's ends with one clear line and exit status 1."""
     from geomocap.cli.app import app
+    from geomocap.cli.error_stream import own_lines_only
     from geomocap.errors import GeomocapError
     from geomocap.reading import reason
 
@@ -22,7 +23,8 @@ def main() -> None:
     with suppress(ValueError):  # not the main thread
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # asked to stop, whoever asks
     try:
-        app()
+        with own_lines_only():
+            app()
     except GeomocapError as error:
         _fail(str(error))
     except OSError as error:

@@ -43,11 +43,16 @@ def make_tiny(folder: Path, variant: str = "voxels") -> Path:
 
 
 def run_tiny(capture: Path, run: Path, *more: str) -> tuple[object, str]:
+    """Make a tiny run in this process; return its exit status and what it told."""
+    return command("run", str(capture), str(run), *QUICK, *more)
+
+
+def command(*arguments: str) -> tuple[object, str]:
     """Run the command line in this process; return its exit status and what it told."""
     from geomocap.cli import main
 
     told = io.StringIO()
-    with patch.object(sys, "argv", ["geomocap", "run", str(capture), str(run), *QUICK, *more]):
+    with patch.object(sys, "argv", ["geomocap", *arguments]):
         with redirect_stderr(told), redirect_stdout(told):
             try:
                 main()

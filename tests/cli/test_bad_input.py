@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import shutil
+import struct
+import subprocess
+import sys
+import zlib
 
 import cv2
 import numpy as np
@@ -50,6 +54,45 @@ def test_truncated_png(capture, geomocap, tmp_path):
     file.write_bytes(file.read_bytes()[:5000])
     said = refused(geomocap("run", capture, tmp_path / "run", *SETTINGS, check=False))
     assert f"{file}: damaged or truncated" in said
+
+
+def jfif_of_another_revision(image):
+    """A JPEG that libjpeg reads, with a line about its marker on the error stream."""
+    data = bytearray(cv2.imencode(".jpg", image)[1].tobytes())
+    data[data.index(b"JFIF\0") + 5] = 9
+    return bytes(data)
+
+
+def no_pixels(image):
+    """A PNG whose parts have right checksums, but no picture in them: libpng says so by itself, too."""
+    png = cv2.imencode(".png", image)[1].tobytes()
+    begin, end = png.index(b"IDAT"), png.index(b"IEND") - 4
+    part = b"IDAT" + bytes(20)
+    return png[: begin - 4] + struct.pack(">I", 20) + part + struct.pack(">I", zlib.crc32(part)) + png[end:]
+
+
+def huge_bitmap(image):
+    """Claims a hundred million pixels, of which Pillow warns."""
+    bitmap = bytearray(cv2.imencode(".bmp", image)[1].tobytes())
+    bitmap[18:26] = struct.pack("<ii", 10_000, 10_000)
+    return bytes(bitmap)
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [(jfif_of_another_revision, 0), (no_pixels, 1), (huge_bitmap, 1)],
+    ids=["jfif", "png", "bitmap"],
+)
+def test_libraries_say_nothing_beside_the_one_line(capture, tmp_path, made, said):
+    folder = sorted((capture / "images").iterdir())[1]
+    for file in folder.iterdir():
+        file.write_bytes(made(cv2.imread(str(file))))
+    command = [sys.executable, "-m", "geomocap", "silhouettes", str(capture), str(tmp_path / "run")]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == said
+    beside = [line for line in result.stderr.splitlines() if line.strip() and "━" not in line]
+    assert [line for line in beside if not line.startswith(("geomocap: ", "warning: ", "note: "))] == []
+    assert sum(line.startswith("geomocap: ") for line in beside) == said
 
 
 def test_truncated_video(capture, geomocap, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 import zlib
 
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from PIL import Image, ImageFile
 
 from geomocap.errors import CaptureError
+from geomocap.files import jpeg_blocks
 from geomocap.files.image_formats import image_header
 from geomocap.files.images import ImageFolder, image_size, read_image
 from geomocap.files.jpeg_blocks import jpeg_flaw
@@ -41,6 +43,8 @@ def jpeg(image, mode="RGB", **options):
         {"quality": 30, "subsampling": 2},
         {"quality": 90, "subsampling": 0, "optimize": True},
         {"quality": 75, "progressive": True},
+        {"quality": 100, "progressive": True, "subsampling": 0, "restart_marker_blocks": 3},
+        {"quality": 10, "progressive": True, "subsampling": 2, "restart_marker_rows": 1},
         {"quality": 75, "restart_marker_rows": 1},
         {"quality": 1},
     ],
@@ -56,8 +60,9 @@ def test_black_and_white_pixels_are_within_8_bits(quality):
         assert jpeg_flaw(cv2.imencode(".jpg", image.astype(np.uint8), [1, quality])[1].tobytes()) == ""
 
 
-def test_changed_bytes_of_a_jpeg_are_nearly_always_told():
-    whole = jpeg(picture(), quality=90)
+@pytest.mark.parametrize("progressive", [False, True])
+def test_changed_bytes_of_a_jpeg_are_nearly_always_told(progressive):
+    whole = jpeg(picture(), quality=90, progressive=progressive)
     rng, told = np.random.default_rng(0), 0
     for _ in range(300):
         data = bytearray(whole)
@@ -67,20 +72,31 @@ def test_changed_bytes_of_a_jpeg_are_nearly_always_told():
     assert told > 285
 
 
-def test_compiled_and_plain_code_say_the_same():
-    from geomocap.files import jpeg_blocks
-
-    whole, rng = jpeg(picture(24, 16), quality=80), np.random.default_rng(1)
-    compiled = jpeg_blocks.follow_codes
+@pytest.mark.parametrize(("progressive", "kernel"), [(False, "follow_codes"), (True, "follow_progressive")])
+def test_compiled_and_plain_code_say_the_same(progressive, kernel, monkeypatch):
+    whole, rng = jpeg(picture(24, 16), quality=80, progressive=progressive), np.random.default_rng(1)
+    compiled = getattr(jpeg_blocks, kernel)
     for _ in range(12):
         data = bytearray(whole)
         data[int(rng.integers(300, len(data)))] ^= int(rng.integers(1, 256))
         said = jpeg_flaw(bytes(data))
-        jpeg_blocks.follow_codes = compiled.py_func
-        try:
+        with monkeypatch.context() as patched:
+            patched.setattr(jpeg_blocks, kernel, compiled.py_func)
             assert jpeg_flaw(bytes(data)) == said
-        finally:
-            jpeg_blocks.follow_codes = compiled
+
+
+def test_scans_of_a_progressive_jpeg_go_on_where_those_before_ended():
+    whole = jpeg(picture(), quality=90, progressive=True)
+    scans = list(re.finditer(rb"\xff\xda(?:[^\xff]|\xff[\x00\xd0-\xd7])+", whole))
+    without = [jpeg_flaw(whole[: scan.start()] + whole[scan.end() :]) for scan in scans]
+    refined = 6  # scans of all coefficients, or that later ones refine; without the others it is less sharp
+    assert without == ["its markers are damaged"] * refined + [""] * (len(scans) - refined)
+    assert jpeg_flaw(whole[: scans[0].start()] + b"\xff\xd9") == "no whole picture in it"
+
+
+def test_jpegs_of_arithmetic_codes_are_no_frames():
+    whole = jpeg(picture(), progressive=True)
+    assert jpeg_flaw(whole.replace(b"\xff\xc2", b"\xff\xca")) == "of a kind that isn't read, SOF10"
 
 
 def test_a_damaged_block_is_told_with_its_row(tmp_path):
