@@ -280,6 +280,7 @@ def test_voxels_and_rays_are_read_as_in_numpy() -> None:
     says = rng.integers(-50, 20, others.valid.shape).astype(np.int8)
     beyond = np.array([-5, 0, -7], np.int8)
     origin, edge, shape = np.array([-0.7, -0.6, -0.9]), 0.09, (15, 14, 20)
+    origin.setflags(write=False)  # as a grid's
     volume = np.empty((3, *shape), np.int8)
     gather(others.projections, says, beyond, origin, edge, volume)
     centers = origin + (np.stack(np.mgrid[:15, :14, :20], axis=-1) + 0.5) * edge
