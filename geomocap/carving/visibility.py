@@ -159,36 +159,51 @@ def _faces_camera(faces, dx, dy, dz, half):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _draw(P, centers, surface, faces, origin, edge, depth):
-    C, H, W = depth.shape
-    half = 0.5 * edge
+    C, N = len(depth), len(surface)
+    places = np.empty((3, N))
+    for a in range(3):
+        for n in range(N):
+            places[a, n] = origin[a] + (surface[n, a] + 0.5) * edge
+    box, near = np.empty((4, N), np.int32), np.empty(N, np.float32)
     for c in range(C):
-        for n in range(len(surface)):
-            x = origin[0] + (surface[n, 0] + 0.5) * edge
-            y = origin[1] + (surface[n, 1] + 0.5) * edge
-            z = origin[2] + (surface[n, 2] + 0.5) * edge
-            if not _faces_camera(faces[n], centers[c, 0] - x, centers[c, 1] - y, centers[c, 2] - z, half):
-                continue
-            w = P[c, 2, 0] * x + P[c, 2, 1] * y + P[c, 2, 2] * z + P[c, 2, 3]
-            if w <= edge:
-                continue
-            u = (P[c, 0, 0] * x + P[c, 0, 1] * y + P[c, 0, 2] * z + P[c, 0, 3]) / w
-            v = (P[c, 1, 0] * x + P[c, 1, 1] * y + P[c, 1, 2] * z + P[c, 1, 3]) / w
-            du, dv = 0.0, 0.0
-            for a in range(3):
-                du += abs(P[c, 0, a] - u * P[c, 2, a])
-                dv += abs(P[c, 1, a] - v * P[c, 2, a])
-            du *= half / w
-            dv *= half / w
-            if u + du < 0 or v + dv < 0 or u - du >= W or v - dv >= H:
-                continue
-            # pixels whose centres lie in the rectangle, and the one that holds the voxel's centre
-            u0, u1 = min(int(np.ceil(u - du - 0.5)), int(np.floor(u))), max(int(u + du - 0.5), int(np.floor(u)))
-            v0, v1 = min(int(np.ceil(v - dv - 0.5)), int(np.floor(v))), max(int(v + dv - 0.5), int(np.floor(v)))
-            d = np.float32(w)
-            for row in range(max(v0, 0), min(v1, H - 1) + 1):
-                for column in range(max(u0, 0), min(u1, W - 1) + 1):
+        _project_cubes(P[c], centers[c], places, faces, 0.5 * edge, depth.shape[1:], box, near)
+        for n in range(N):
+            d = near[n]
+            for row in range(box[2, n], box[3, n] + 1):
+                for column in range(box[0, n], box[1, n] + 1):
                     if d < depth[c, row, column]:
                         depth[c, row, column] = d
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _project_cubes(P, center, places, faces, half, size, box, near):
+    """Find the rectangle (first and last column, first and last row) of each voxel's cube in an image, and its depth.
+
+    It holds the pixels whose centres lie in the rectangle round the projected cube, and the one of the voxel's centre.
+    There are none (the last row is -1) where no free face is turned to the camera. Without branches, so that several
+    voxels are done at once.
+    """
+    H, W = np.float64(size[0]), np.float64(size[1])
+    p00, p01, p02, p03 = P[0, 0], P[0, 1], P[0, 2], P[0, 3]
+    p10, p11, p12, p13 = P[1, 0], P[1, 1], P[1, 2], P[1, 3]
+    p20, p21, p22, p23 = P[2, 0], P[2, 1], P[2, 2], P[2, 3]
+    xs, ys, zs = places[0], places[1], places[2]
+    first_column, last_column, first_row, last_row = box[0], box[1], box[2], box[3]
+    for n in range(faces.size):
+        x, y, z = xs[n], ys[n], zs[n]
+        w = p20 * x + p21 * y + p22 * z + p23
+        u = (p00 * x + p01 * y + p02 * z + p03) / w
+        v = (p10 * x + p11 * y + p12 * z + p13) / w
+        du = (abs(p00 - u * p20) + abs(p01 - u * p21) + abs(p02 - u * p22)) * (half / w)
+        dv = (abs(p10 - v * p20) + abs(p11 - v * p21) + abs(p12 - v * p22)) * (half / w)
+        drawn = _faces_camera(faces[n], center[0] - x, center[1] - y, center[2] - z, half) & (w > 2 * half)
+        drawn &= (u + du >= 0) & (v + dv >= 0) & (u - du < W) & (v - dv < H)
+        first_column[n] = np.int32(max(min(np.ceil(u - du - 0.5), np.floor(u)), 0.0))
+        first_row[n] = np.int32(max(min(np.ceil(v - dv - 0.5), np.floor(v)), 0.0))
+        last_column[n] = np.int32(min(max(np.trunc(u + du - 0.5), np.floor(u)), W - 1))
+        bottom = np.int32(min(max(np.trunc(v + dv - 0.5), np.floor(v)), H - 1))
+        last_row[n] = bottom if drawn else np.int32(-1)
+        near[n] = w
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -197,6 +212,7 @@ def _look(
 ):
     C, H, W = masks.shape
     half = 0.5 * edge
+    reaches = half * np.sqrt(P[:, 0, 0] ** 2 + P[:, 0, 1] ** 2 + P[:, 0, 2] ** 2)  # half a voxel's, at a metre, pixels
     for n in range(len(surface)):
         x = origin[0] + (surface[n, 0] + 0.5) * edge
         y = origin[1] + (surface[n, 1] + 0.5) * edge
@@ -216,8 +232,7 @@ def _look(
                 continue
             seen[n, c] = 1
             # mean colour under the voxel's own square, range of colours in the window
-            reach = half * np.sqrt(P[c, 0, 0] ** 2 + P[c, 0, 1] ** 2 + P[c, 0, 2] ** 2) / w
-            reach = min(reach, 4.0)
+            reach = min(reaches[c] / w, 4.0)
             own_u0, own_u1 = int(np.floor(u - reach)), int(np.floor(u + reach))
             own_v0, own_v1 = int(np.floor(v - reach)), int(np.floor(v + reach))
             r = g = b = 0

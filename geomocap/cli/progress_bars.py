@@ -23,7 +23,8 @@ def progress_bars() -> Iterator[Progress]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Bars(*columns, console=console) as bars:
+    # Elsewhere than in a terminal they are shown once, at the end: nothing has to be drawn before
+    with Bars(*columns, console=console, auto_refresh=console.is_terminal, refresh_per_second=4) as bars:
         tasks: dict[str, TaskID] = {}
 
         def report(stage: str, done: int, total: int) -> None:

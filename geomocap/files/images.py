@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -17,6 +17,7 @@ import numpy as np
 from geomocap.errors import CaptureError
 from geomocap.files.atomic import write_bytes
 from geomocap.files.image_formats import MOST_PIXELS, ImageHeader, image_flaw, image_header
+from geomocap.files.kept_frames import KeptFrames
 from geomocap.reading import open_plain, read_bytes
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
@@ -164,9 +165,16 @@ def bits_for(largest: int) -> int:
 
 @dataclass(frozen=True)
 class ImageFolder:
-    """Frames of one camera as numbered image files."""
+    """Frames of one camera as numbered image files; those of a short recording are decoded once."""
 
     files: tuple[Path, ...]
+    _kept: KeptFrames = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_kept", KeptFrames(len(self.files)))
+
+    def __reduce__(self) -> tuple[type[ImageFolder], tuple[tuple[Path, ...]]]:
+        return ImageFolder, (self.files,)
 
     def __len__(self) -> int:
         return len(self.files)
@@ -186,8 +194,12 @@ class ImageFolder:
 
     def read(self, frame: int) -> np.ndarray:
         """Return frame `frame` as (H, W, 3) uint8, RGB."""
+        kept = self._kept.get(frame)
+        if kept is not None:
+            return kept
         image = read_image(self.files[frame], bits=self.bits)
         self.check_size(frame, (image.shape[1], image.shape[0]))
+        self._kept.keep(frame, image)
         return image
 
     def check_size(self, frame: int, size: tuple[int, int]) -> None:

@@ -326,5 +326,5 @@ def fit_ellipsoids(points: np.ndarray, labels: np.ndarray, count: int, spacing: 
     moments = np.zeros((count, 10))
     for k in range(count):
         range_moments(grid, ends[k], ends[k + 1], moments[k])
-    errors = union_errors(grid, ends[:-1], ends[1:], np.arange(count), moments)
+    errors = union_errors(grid, ends[:-1], ends[1:], np.arange(count, dtype=np.int32), moments)
     return from_moments(moments, errors, origin, spacing)

@@ -27,12 +27,12 @@ def heaviest_choices(
     list of int or None
         None: no sum is above.
     """
-    order = np.argsort(-weights, kind="stable")
+    order = np.argsort(-weights, kind="stable")[::-1]  # the heaviest of a set is its highest bit
     value = weights[order].tolist()
     apart = excluded | (groups[:, None] == groups) | (kinds[:, None] == kinds)
     allowed = [_bits(row) for row in ~apart[np.ix_(order, order)]]
-    of_group = [_bits(groups[order] == g) for g in np.unique(groups)]
-    of_kind = [_bits(kinds[order] == k) for k in np.unique(kinds)]
+    other_groups = [_bits(row) for row in groups[order, None] != groups[order]]
+    other_kinds = [_bits(row) for row in kinds[order, None] != kinds[order]]
     best: tuple[float, list[int] | None] = (above, None)
     stack: list[tuple[int, float, list[int]]] = [((1 << len(value)) - 1, 0.0, [])]
     nodes = 0
@@ -41,30 +41,28 @@ def heaviest_choices(
         left, total, taken = stack.pop()
         if total > best[0] + 1e-12:
             best = total, taken
-        if not left:
-            continue
         least = best[0] + 1e-12
-        if total + _room(left, of_group, value) <= least or total + _room(left, of_kind, value) <= least:
+        if not (_exceeds(least, total, left, other_groups, value) and _exceeds(least, total, left, other_kinds, value)):
             continue
-        first = _first(left)
+        first = left.bit_length() - 1
         stack.append((left & ~(1 << first), total, taken))
         stack.append((left & allowed[first], total + value[first], [*taken, first]))
     return None if best[1] is None else [int(order[i]) for i in best[1]]
 
 
-def _room(left: int, sets: list[int], value: list[float]) -> float:
-    """Most that choices from what is left can add, one of each set; values fall."""
-    room = 0.0
-    for s in sets:
-        some = left & s
-        if some:
-            room += value[(some & -some).bit_length() - 1]
-    return room
+def _exceeds(least: float, total: float, left: int, others: list[int], value: list[float]) -> bool:
+    """Whether choices from what is left, one of each set, can bring the total above `least`.
+
+    `others` tells for each choice those of all other sets.
+    """
+    while left:
+        first = left.bit_length() - 1
+        total += value[first]
+        if total > least:
+            return True
+        left &= others[first]
+    return False
 
 
 def _bits(mask: np.ndarray) -> int:
     return int.from_bytes(np.packbits(mask, bitorder="little").tobytes(), "little")
-
-
-def _first(bits: int) -> int:
-    return (bits & -bits).bit_length() - 1

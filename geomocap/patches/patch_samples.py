@@ -20,7 +20,7 @@ def choose_samples(A, center, shape, template, usable, mask, use_mask, with_slop
     """
     M = len(shape)
     H, W = mask.shape
-    count, offered = 0, 0
+    count, offered = np.int64(0), 0  # no literal: Numba would compile what is called for it, too
     mean_t = 0.0
     for q in range(0, M, stride):
         if not usable[q]:

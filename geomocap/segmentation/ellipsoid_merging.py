@@ -26,7 +26,7 @@ def _union_error(
     for first in (i, j):
         leaf = first
         while leaf >= 0:
-            total += error_terms(points, starts[leaf], starts[leaf + 1], m, variances, axes)
+            total += error_terms(points, np.int64(starts[leaf]), np.int64(starts[leaf + 1]), m, variances, axes)
             if total > enough:
                 return _NONE
             leaf = after[leaf]
@@ -68,7 +68,7 @@ def merge_leaves(
             if touches[i, j]:
                 errors[i, j] = _union_error(points, starts, after, moments, i, j, limit)
     while True:
-        a, b, best = -1, -1, limit
+        a, b, best = np.int64(-1), np.int64(-1), limit  # no literals: Numba would compile what is called for these, too
         for i in range(n):
             if alive[i]:
                 for j in range(i + 1, n):

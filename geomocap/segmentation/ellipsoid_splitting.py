@@ -114,7 +114,7 @@ def split_points(
     depth = np.empty(max_depth + 2, np.int64)
     waiting = np.empty((max_depth + 2, 10))
     begin[0], end[0], depth[0] = 0, n, 0
-    range_moments(pts, 0, n, waiting[0])
+    range_moments(pts, begin[0], end[0], waiting[0])
     top, leaves = 1, 0
     variances = np.empty(3)
     axes = np.empty((3, 3))

@@ -45,10 +45,20 @@ def light_change(
         if ok.sum() < 50:
             continue
         xc, yc, sc = x[ok, c], y[ok, c], s[ok]
-        gain[c] = np.median(yc / xc)
-        scale = 1.4826 * np.median(np.abs(yc - gain[c] * xc) / sc)
+        gain[c] = _median(yc / xc)
+        scale = 1.4826 * _median(np.abs(yc - gain[c] * xc) / sc)
         gain[c], offset[c] = _reweighted_line(xc, yc, sc, gain[c], max(scale, 1.0))
     return gain, offset
+
+
+def _median(values: np.ndarray) -> float:
+    """Median of some finite values (N,), which change their order: `np.median` takes ten times as long to call."""
+    half = len(values) // 2
+    if len(values) % 2:
+        values.partition(half)
+        return float(values[half])
+    values.partition((half - 1, half))
+    return float(values[half - 1] + values[half]) / 2
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

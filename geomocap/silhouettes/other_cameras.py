@@ -155,7 +155,8 @@ class OtherCameras:
         enough = int(STEPS * max(SURE, agreement(len(small))))
         result = []
         for c, camera in enumerate(self.cameras):
-            word = best_on_rays(camera.origin, camera.rays, volume[c], total, grid.origin, grid.voxel_size, enough)
+            others = total - volume[c]
+            word = best_on_rays(camera.origin, camera.rays, others, grid.origin, grid.voxel_size, enough)
             result.append(camera.enlarge(word, odds[c].shape))
         return result
 
@@ -272,7 +273,11 @@ def gather(P, says, beyond, origin, edge, volume):
         Filled in.
     """
     C, H, W = says.shape
+    heights = origin[2] + (np.arange(volume.shape[3]) + 0.5) * edge
+    pixels = np.empty(heights.size, np.int32)
     for c in range(C):
+        said = says[c].ravel()
+        along = P[c, 0, 2], P[c, 1, 2], P[c, 2, 2]
         for i in range(volume.shape[1]):
             x = origin[0] + (i + 0.5) * edge
             for j in range(volume.shape[2]):
@@ -280,26 +285,27 @@ def gather(P, says, beyond, origin, edge, volume):
                 a = P[c, 0, 0] * x + P[c, 0, 1] * y + P[c, 0, 3]
                 b = P[c, 1, 0] * x + P[c, 1, 1] * y + P[c, 1, 3]
                 d = P[c, 2, 0] * x + P[c, 2, 1] * y + P[c, 2, 3]
-                for k in range(volume.shape[3]):
-                    z = origin[2] + (k + 0.5) * edge
-                    w = d + P[c, 2, 2] * z
-                    volume[c, i, j, k] = beyond[c]
-                    if w > 0:
-                        u, v = (a + P[c, 0, 2] * z) / w, (b + P[c, 1, 2] * z) / w
-                        if 0 <= u < W and 0 <= v < H:
-                            volume[c, i, j, k] = says[c, int(v), int(u)]
+                for k in range(heights.size):  # without branches, several at once
+                    w = d + along[2] * heights[k]
+                    u, v = (a + along[0] * heights[k]) / w, (b + along[1] * heights[k]) / w
+                    inside = (w > 0) & (u >= 0) & (u < W) & (v >= 0) & (v < H)
+                    pixel = np.int32(v) * np.int32(W) + np.int32(u)
+                    pixels[k] = pixel if inside else np.int32(-1)
+                column = volume[c, i, j]
+                for k in range(heights.size):
+                    column[k] = said[np.uint32(pixels[k])] if pixels[k] >= 0 else beyond[c]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def best_on_rays(origin, rays, own, total, low, edge, enough):
+def best_on_rays(origin, rays, others, low, edge, enough):
     """Largest sum of what the other cameras say of a voxel on each ray.
 
     Parameters
     ----------
     origin : (3,) float
     rays : (H, W, 3) float32
-    own, total : (X, Y, Z) int8, int16
-        What the camera itself says, and all cameras together.
+    others : (X, Y, Z) int16
+        What all other cameras together say.
     low : (3,) float
         Lowest corner of the grid.
     edge : float
@@ -312,30 +318,43 @@ def best_on_rays(origin, rays, own, total, low, edge, enough):
         Log odds; NOWHERE at least and on rays that miss the grid.
     """
     result = np.empty(rays.shape[:2], np.float32)
-    X, Y, Z = total.shape
+    shape = others.shape
+    columns, cells = np.uint32(shape[1]), np.uint32(shape[2])
+    flat = others.ravel()
+    start, ray = np.empty(3), np.empty(3)
     for y in range(rays.shape[0]):
         for x in range(rays.shape[1]):
             near, far = 0.0, 1e30
             for axis in range(3):
-                d = np.float64(rays[y, x, axis])
-                if abs(d) < 1e-9:
-                    d = np.float64(1e-9)
-                t0, t1 = (low[axis] - origin[axis]) / d, (low[axis] + total.shape[axis] * edge - origin[axis]) / d
+                ray[axis] = rays[y, x, axis]
+                d = ray[axis] if abs(ray[axis]) >= 1e-9 else 1e-9
+                t0, t1 = (low[axis] - origin[axis]) / d, (low[axis] + shape[axis] * edge - origin[axis]) / d
                 near, far = max(near, min(t0, t1)), min(far, max(t0, t1))
             best = np.int64(NOWHERE * STEPS)
             if near < far:
-                p, q, r = (
-                    (origin[0] + near * rays[y, x, 0] - low[0]) / edge,
-                    (origin[1] + near * rays[y, x, 1] - low[1]) / edge,
-                    (origin[2] + near * rays[y, x, 2] - low[2]) / edge,
-                )
-                for n in range(int((far - near) / edge) + 1):
+                for axis in range(3):
+                    start[axis] = (origin[axis] + near * ray[axis] - low[axis]) / edge
+                # Steps of a voxel; rounding may put the first and the last ones outside
+                n, last = 0, int((far - near) / edge)
+                while n <= last and not _inside(start, ray, n + 0.5, shape):
+                    n += 1
+                while n < last and not _inside(start, ray, last + 0.5, shape):
+                    last -= 1
+                a, b, c, u, v, w = start[0], start[1], start[2], ray[0], ray[1], ray[2]
+                while n <= last and best < enough:
                     t = n + 0.5
-                    a, b, c = p + t * rays[y, x, 0], q + t * rays[y, x, 1], r + t * rays[y, x, 2]
-                    if 0 <= a < X and 0 <= b < Y and 0 <= c < Z:
-                        i, j, k = int(a), int(b), int(c)
-                        best = max(best, np.int64(total[i, j, k]) - own[i, j, k])
-                        if best >= enough:
-                            break
+                    i, j, k = np.int32(a + t * u), np.int32(b + t * v), np.int32(c + t * w)
+                    at = (np.uint32(i) * columns + np.uint32(j)) * cells + np.uint32(k)
+                    best = max(best, np.int64(flat[at]))
+                    n += 1
             result[y, x] = best / STEPS
     return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _inside(start, ray, t, shape):
+    """Whether a ray is in the grid at t; all in voxels."""
+    for axis in range(3):
+        if not 0 <= start[axis] + t * ray[axis] < shape[axis]:
+            return False
+    return True

@@ -165,6 +165,40 @@ def test_visibility_is_that_of_ray_casting():
     assert total > 10000 and agree > 0.97 * total
 
 
+def test_depth_buffers_are_those_of_drawing_cube_after_cube():
+    grid = Grid(np.array([-0.5, -0.5, -0.2]), 0.05, (20, 20, 20))
+    x, y, z = grid.axes()
+    points = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
+    voxels = SurfaceVoxels.of(Occupancy.of_dense(np.linalg.norm(points - [0, 0, 0.3], axis=-1) < 0.4))
+    P = cameras(3)[[0, 1, 5]]
+    P[2, 0] += 100 * P[2, 2]  # one that sees a part of it
+    views = PinholeViews.of(P, [np.ones((HEIGHT, WIDTH), np.uint8)] * 3)
+    expected = np.full((3, HEIGHT, WIDTH), np.inf, np.float32)
+    half = 0.5 * grid.voxel_size
+    for c in range(3):
+        eye = -np.linalg.solve(P[c, :, :3], P[c, :, 3])
+        for index, free in zip(voxels.indices, voxels.faces, strict=True):
+            center = grid.origin + (index + 0.5) * grid.voxel_size
+            turned = np.column_stack([eye - center < -half, eye - center > half]).ravel()
+            if not (turned & [free >> f & 1 for f in range(6)]).any():
+                continue
+            uw, vw, w = P[c, :, :3] @ center + P[c, :, 3]
+            (u, du), (v, dv) = (
+                (t / w, np.abs(P[c, a, :3] - t / w * P[c, 2, :3]).sum() * half / w) for a, t in enumerate((uw, vw))
+            )
+            columns, rows = np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5
+            across = (np.abs(columns - u) <= du) | (np.floor(u) == columns - 0.5)
+            along = (np.abs(rows - v) <= dv) | (np.floor(v) == rows - 0.5)
+            part = np.ix_(along, across)
+            expected[c][part] = np.minimum(expected[c][part], np.float32(w))
+    depth = depth_buffers(views, grid, voxels)
+    assert (
+        np.isfinite(expected).any(axis=(1, 2)).all() and np.isfinite(expected[2]).sum() < np.isfinite(expected[1]).sum()
+    )
+    np.testing.assert_array_equal(np.isfinite(depth), np.isfinite(expected))
+    np.testing.assert_allclose(depth, expected, rtol=1e-6)
+
+
 def test_normals_of_a_ball_point_outwards():
     x, y, z = np.mgrid[0:50, 0:47, 0:70]
     middle = np.array([24, 23, 33])

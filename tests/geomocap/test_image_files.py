@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import pickle
 import re
 import struct
 import zlib
@@ -165,6 +166,27 @@ def test_deep_pictures_are_scaled_by_the_bits_that_the_camera_uses(tmp_path, bit
     assert np.abs(folder.read(1) - 0.05 * image).max() <= 1
     with pytest.raises(CaptureError, match="save all alike"):
         read_image(files[0], bits=8)
+
+
+def test_frames_of_a_short_recording_are_decoded_once(tmp_path, monkeypatch):
+    files = tuple(tmp_path / f"{k:06d}.png" for k in range(3))
+    for k, file in enumerate(files):
+        Image.fromarray(np.roll(picture(), k, axis=0)).save(file)
+    folder = ImageFolder(files)
+    first = folder.read(2)
+    first[:] = 0  # what a reader does to its frame nobody else sees
+    files[2].unlink()
+    np.testing.assert_array_equal(folder.read(2), np.roll(picture(), 2, axis=0))
+    copied = pickle.loads(pickle.dumps(folder))  # files, no pictures, go to other processes
+    assert copied == folder
+    with pytest.raises(CaptureError, match="000002"):
+        copied.read(2)
+    monkeypatch.setattr("geomocap.files.kept_frames.KEPT", 2 * picture().nbytes)
+    long = ImageFolder(files)
+    long.read(1)
+    files[1].unlink()
+    with pytest.raises(CaptureError, match="000001"):
+        long.read(1)
 
 
 def test_pictures_of_real_numbers_are_refused(tmp_path):

@@ -280,6 +280,7 @@ def test_voxels_and_rays_are_read_as_in_numpy() -> None:
     says = rng.integers(-50, 20, others.valid.shape).astype(np.int8)
     beyond = np.array([-5, 0, -7], np.int8)
     origin, edge, shape = np.array([-0.7, -0.6, -0.9]), 0.09, (15, 14, 20)
+    origin.setflags(write=False)  # as a grid's
     volume = np.empty((3, *shape), np.int8)
     gather(others.projections, says, beyond, origin, edge, volume)
     centers = origin + (np.stack(np.mgrid[:15, :14, :20], axis=-1) + 0.5) * edge
@@ -294,10 +295,9 @@ def test_voxels_and_rays_are_read_as_in_numpy() -> None:
     expected = np.where(inside, says[c, v.clip(0, H - 1), u.clip(0, W - 1)], beyond[c])
     assert (expected == volume).mean() > 0.9999  # a centre on the border between two pixels may fall into either
 
-    total = volume.sum(axis=0, dtype=np.int16)
     camera = others.cameras[0]
-    best = best_on_rays(camera.origin, camera.rays, volume[0], total, origin, edge, 10_000)
-    word = total.astype(int) - volume[0]
+    word = volume[1:].sum(axis=0, dtype=np.int16)
+    best = best_on_rays(camera.origin, camera.rays, word, origin, edge, 10_000)
     steps = np.arange(0, 5, edge / 50)
     for y, x in np.argwhere(best < np.inf)[::37]:
         place = np.floor((camera.origin + steps[:, None] * camera.rays[y, x] - origin) / edge).astype(int)
@@ -306,3 +306,22 @@ def test_voxels_and_rays_are_read_as_in_numpy() -> None:
         assert best[y, x] <= finest + 1e-6  # steps of a whole voxel may pass a corner by, but never invent one
         if len(i) > 400:
             assert best[y, x] > NOWHERE
+    for enough in (10_000, 20):
+        best = best_on_rays(camera.origin, camera.rays, word, origin, edge, enough)
+        for y, x in np.argwhere(best < np.inf)[::37]:
+            assert best[y, x] == np.float32(_best_on_ray(camera.origin, camera.rays[y, x], word, origin, edge, enough))
+
+
+def _best_on_ray(origin: np.ndarray, ray: np.ndarray, word: np.ndarray, low: np.ndarray, edge: float, enough: int):
+    """`best_on_rays` of one ray, step by step from where it meets the grid."""
+    ray = ray.astype(float)
+    borders = np.sort((np.array([low, low + np.array(word.shape) * edge]) - origin) / ray, axis=0)
+    near, far = max(0.0, borders[0].max()), borders[1].min()
+    best = NOWHERE * STEPS
+    for n in range(int((far - near) / edge) + 1 if near < far else 0):
+        place = (origin + near * ray - low) / edge + (n + 0.5) * ray
+        if (place >= 0).all() and (place < word.shape).all():
+            best = max(best, word[tuple(place.astype(int))])
+        if best >= enough:
+            break
+    return best / STEPS
