@@ -26,7 +26,8 @@ def _union_error(
     for first in (i, j):
         leaf = first
         while leaf >= 0:
-            total += error_terms(points, np.int64(starts[leaf]), np.int64(starts[leaf + 1]), m, variances, axes)
+            begin, end = int(np.int64(starts[leaf])), int(np.int64(starts[leaf + 1]))
+            total += error_terms(points, begin, end, m, variances, axes)
             if total > enough:
                 return _NONE
             leaf = after[leaf]
@@ -67,8 +68,9 @@ def merge_leaves(
         for j in range(i + 1, n):
             if touches[i, j]:
                 errors[i, j] = _union_error(points, starts, after, moments, i, j, limit)
+    none = int(np.int64(-1))  # no literal: Numba would compile what is called for it, too
     while True:
-        a, b, best = np.int64(-1), np.int64(-1), limit  # no literals: Numba would compile what is called for these, too
+        a, b, best = none, none, limit
         for i in range(n):
             if alive[i]:
                 for j in range(i + 1, n):
