@@ -19,7 +19,6 @@ FOLLOWED = {
     "points": "points that the scans have in common",
     "nodes": "nodes of a deformable surface",
     "both": "nodes of a deformable surface, held by patches of the images",
-    "joined": "patches of the images, and nodes of a deformable surface that patches and images hold",
     "pieces": "patches of the images, and nodes of a deformable surface where these leave it uncovered",
     "ellipsoids": "ellipsoids",
 }

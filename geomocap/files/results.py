@@ -296,7 +296,7 @@ def read_followed_by_frame(run: Run) -> TracksByFrame:
 
 def _followed_nodes(run: Run) -> Trajectories | None:
     found = read_diagnostics(run)
-    if found.sample_positions is not None and found.paths in ("nodes", "both", "joined", "pieces", "points"):
+    if found.sample_positions is not None and found.paths in ("nodes", "both", "pieces", "points"):
         with _named(run.path / DIAGNOSTICS):
             return Trajectories.of_positions(found.sample_positions)
     if not run.has(TRACKS):

@@ -14,7 +14,7 @@ class Diagnostics:
     Attributes
     ----------
     paths : str, optional
-        What the bodies were found from: "patches", "nodes", "both", "joined", "points", "ellipsoids", or "model".
+        What the bodies were found from: "patches", "nodes", "both", "pieces", "points", "ellipsoids", or "model".
     sample_positions : (N, T, 3) float, metres, world
         Motion paths that the bodies were found from.
     sample_body : (N,) int

@@ -1,4 +1,4 @@
-"""How much of a surface motion paths speak for, and what is left to others."""
+"""Which pieces of a surface motion paths speak for, and which are left to others."""
 
 from __future__ import annotations
 
@@ -55,3 +55,24 @@ def uncovered_fraction(points: Callable[[int], np.ndarray], paths: np.ndarray, r
     reach : float, metres
     """
     return float(np.mean([uncovered(points(k), paths[:, k], reach).mean() for k in looks(paths.shape[1])]))
+
+
+def left_over(samples: np.ndarray, paths: np.ndarray, reach: float) -> np.ndarray:
+    """Find which samples lie on pieces for which no path speaks in most of the frames in which they are followed.
+
+    Parameters
+    ----------
+    samples : (K, T, 3) float, metres
+        NaN where not followed.
+    paths : (N, T, 3) float, metres
+    reach : float, metres
+
+    Returns
+    -------
+    (K,) bool
+    """
+    alone, there = np.zeros(len(samples), int), np.isfinite(samples[:, :, 0])
+    for k in range(samples.shape[1]):
+        rows = np.flatnonzero(there[:, k])
+        alone[rows] += uncovered(samples[rows, k], paths[:, k], reach)
+    return 2 * alone > there.sum(axis=1)

@@ -15,7 +15,7 @@ from geomocap.model.frame_geometry import Geometry
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.trajectories import Trajectories
 from geomocap.nodes.node_tracking import track_nodes
-from geomocap.nodes.surface_coverage import SMALLEST_PIECE, piece_reach, uncovered_fraction
+from geomocap.nodes.surface_coverage import SMALLEST_PIECE, left_over, piece_reach, uncovered_fraction
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.track_stage import frame_reader
 from geomocap.segmentation.m3 import ellipsoid_paths
@@ -32,10 +32,10 @@ ANCHOR_FRACTION = 0.1  # those are measured in this fraction of the frames at le
 def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, MotionPaths]:
     """Motion paths by what they are; where there is a choice, bodies tell which are best.
 
-    They are "patches", "nodes", "both" (nodes held by patches and images), "joined" (patches and those nodes, each with
-    its own precision), "points" or "ellipsoids". Nodes are followed only where patches leave a piece of the surface
-    uncovered; then "joined" and "both" are returned. Or where single cameras followed the surface, whose depths are
-    those of the volume as well; then "patches" and "both".
+    They are "patches", "nodes", "both" (nodes held by patches and images), "pieces" (patches, and where these leave
+    pieces of the surface uncovered, those nodes there), "points" or "ellipsoids". Nodes are followed only where some
+    piece needs them; then "pieces" and "both" are returned. Or where single cameras followed the surface, whose depths
+    are those of the volume as well; then "patches" and "both".
 
     Parameters
     ----------
@@ -65,6 +65,7 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
                 f"{job.run.path}: no surface patches could be followed in the images; set segmentation.paths = nodes"
             )
         return {"patches": patches}
+    reach = 0.0
     if patches is not None and patches.ray is None:
         reach = piece_reach(geometry.points(0))
         if uncovered_fraction(geometry.points, patches.positions, reach) < SMALLEST_PIECE:
@@ -77,7 +78,8 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
         return {"nodes" if tracked is None else "both": held}
     if patches.ray is not None:  # what these leave uncovered is bulk of a hull of few cameras, and no piece
         return {"patches": patches, "both": held}
-    return {"joined": _joined(patches, nodes), "both": held}
+    rest = left_over(nodes.positions, patches.positions, reach)
+    return {"pieces": _joined(patches, nodes, rest), "both": held}
 
 
 def _follow_nodes(job: Job, geometry: Geometry, anchors: MotionPaths | None) -> MotionPaths:
@@ -128,15 +130,13 @@ def _paths_of(tracked: Trajectories, chosen: np.ndarray) -> MotionPaths:
     return MotionPaths(tracked.positions[chosen], sigma=np.where(alone, ALONE_FRACTION, 1.0) * sigma, ray=ray)
 
 
-def _joined(patches: MotionPaths, nodes: MotionPaths) -> MotionPaths:
-    """Patches followed by the nodes, each with its own precision.
-
-    Nodes speak where patches leave the surface uncovered. Elsewhere they hardly count, but they are there all the time:
-    they lead patches through the frames in which these are not seen.
-    """
+def _joined(patches: MotionPaths, nodes: MotionPaths, rest: np.ndarray) -> MotionPaths:
+    """Patches followed by the nodes that are on the rest of the surface, (K,) bool, each with its own precision."""
+    if not rest.any():
+        return patches
+    positions = np.concatenate([patches.positions, nodes.positions[rest]])
     assert patches.sigma is not None and nodes.sigma is not None and patches.ray is None
-    positions = np.concatenate([patches.positions, nodes.positions])
-    return MotionPaths(positions, sigma=np.concatenate([patches.sigma, nodes.sigma]))
+    return MotionPaths(positions, sigma=np.concatenate([patches.sigma, nodes.sigma[rest]]))
 
 
 def _anchors(tracked: Trajectories) -> MotionPaths | None:

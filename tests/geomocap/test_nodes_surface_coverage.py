@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geomocap.nodes.surface_coverage import SMALLEST_PIECE, piece_reach, uncovered, uncovered_fraction
+from geomocap.nodes.surface_coverage import SMALLEST_PIECE, left_over, piece_reach, uncovered, uncovered_fraction
 
 FRAMES = 10
 
@@ -41,3 +41,11 @@ def test_fraction_counts_frames_without_paths():
     paths[paths[:, 0, 0] > 0.5, 5:] = np.nan  # half the square, in half the frames
     fraction = uncovered_fraction(lambda k: square(0.02), paths, 0.1)
     assert 0.5 * 0.4 * 4 / 9 - 0.05 < fraction < 0.25
+
+
+def test_left_over_is_what_is_uncovered_in_most_frames_in_which_it_is_there():
+    paths = standing(np.zeros((1, 3)))
+    paths[:, 7:] = np.nan
+    samples = standing(np.array([[0.05, 0, 0], [1.0, 0, 0], [0.05, 0, 0]]))
+    samples[2, :6] = np.nan  # there in frames 6 to 9: uncovered in three of four
+    np.testing.assert_array_equal(left_over(samples, paths, 0.1), [False, True, True])

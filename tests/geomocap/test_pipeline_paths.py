@@ -75,15 +75,15 @@ def test_patches_where_they_cover_the_subject(job):
     assert list(motion_paths(job("auto", trajectories(500, 1.0)), Ball(), True)) == ["patches"]
 
 
-def test_patches_and_nodes_where_patches_leave_a_piece_uncovered(job):
+def test_nodes_on_the_piece_that_patches_leave_uncovered(job):
     tracks = trajectories(300, 1.0, 0.0)
     found = motion_paths(job("auto", tracks), Ball(), True)
-    assert list(found) == ["joined", "both"]
-    paths = found["joined"]
+    assert list(found) == ["pieces", "both"]
+    paths = found["pieces"]
     patches, nodes = paths.positions[:300], paths.positions[300:]
     np.testing.assert_array_equal(patches, tracks)
-    np.testing.assert_array_equal(nodes, found["both"].positions)
-    assert len(nodes) == 60
+    assert 15 <= len(nodes) <= 30  # of 60, those on the half without patches
+    assert (np.nanmax(nodes[:, :, 2], axis=1) < 0.0).all()
     # the nodes' precision is their own: nothing holds them along the surface
     assert np.nanmedian(paths.sigma[300:]) > 5 * np.nanmedian(paths.sigma[:300])
 
@@ -100,7 +100,10 @@ def test_where_single_cameras_follow_the_surface_there_are_nodes_to_choose_inste
 def test_nodes_where_patches_are_there_for_a_while_only(job):
     tracks = trajectories(300, 1.0)
     tracks[:, 1:][tracks[:, 1:, 2] < 0] = np.nan  # 2 of 3 frames
-    assert list(motion_paths(job("auto", tracks), Ball(), True)) == ["joined", "both"]
+    found = motion_paths(job("auto", tracks), Ball(), True)
+    assert list(found) == ["pieces", "both"]
+    paths = found["pieces"]
+    assert (np.nanmax(paths.positions[300:, :, 2], axis=1) < 0.0).all()
 
 
 def test_nodes_without_patches(job):
