@@ -26,7 +26,7 @@ def _union_error(
     for first in (i, j):
         leaf = first
         while leaf >= 0:
-            total += error_terms(points, np.int64(starts[leaf]), np.int64(starts[leaf + 1]), m, variances, axes)
+            total += error_terms(points, starts[leaf], starts[leaf + 1], m, variances, axes)
             if total > enough:
                 return _NONE
             leaf = after[leaf]
@@ -68,13 +68,13 @@ def merge_leaves(
             if touches[i, j]:
                 errors[i, j] = _union_error(points, starts, after, moments, i, j, limit)
     while True:
-        a, b, best = np.int64(-1), np.int64(-1), limit  # no literals: Numba would compile what is called for these, too
+        a, b, best = n, n, limit
         for i in range(n):
             if alive[i]:
                 for j in range(i + 1, n):
                     if errors[i, j] < best:
                         a, b, best = i, j, errors[i, j]
-        if a < 0:
+        if a == n:
             break
         moments[a] += moments[b]
         after[tail[a]] = b
@@ -114,4 +114,4 @@ def merge_frame(split: SplitFrame, limit: float) -> np.ndarray:
         Merged set of each leaf.
     """
     contacts = count_contacts(split.points, split.leaves, len(split.errors))
-    return merge_leaves(split.points, split.starts, split.moments, contacts, limit)
+    return merge_leaves(split.points, split.starts.astype(np.int64), split.moments, contacts, limit)
