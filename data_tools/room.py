@@ -105,7 +105,7 @@ def _render(
                     bottom = (1 - a) * corners[row + 1, column, k] + a * corners[row + 1, column + 1, k]
                     d[k] = (1 - b) * top + b * bottom
                 # The wall that the ray leaves the box through
-                depth, axis = 1e30, 2
+                depth, axis = 1e30, len(d) - 1  # no literal: Numba would compile walls for it, too
                 for k in range(3):
                     if d[k] != 0.0:
                         t = ((high[k] if d[k] > 0 else low[k]) - origin[k]) / d[k]

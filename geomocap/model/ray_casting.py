@@ -93,7 +93,7 @@ def touched_pixels(corners: np.ndarray, faces: np.ndarray, width: int, height: i
     if not np.isfinite(corners).all():
         return np.ones((height, width), bool)
     tiles = np.zeros((-(-height // _TILE), -(-width // _TILE)), bool)
-    mark_tiles(np.ascontiguousarray(corners), faces, tiles)
+    mark_tiles(np.ascontiguousarray(corners), np.ascontiguousarray(faces, np.int64), tiles)
     return np.repeat(np.repeat(tiles, _TILE, axis=0), _TILE, axis=1)[:height, :width]
 
 

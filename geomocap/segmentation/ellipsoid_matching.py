@@ -57,7 +57,7 @@ def halve(
     a, b = begin[k], end[k]
     if b - a < 2:
         return False
-    once = int(np.int64(1))  # no literal: Numba would compile the splitting anew for it
+    once = min(b - a, 1)  # no literal: Numba would compile the splitting anew for it
     pts, within, starts, parts, _ = split_points(points[a:b], 0.0, once, once)
     if starts.shape[0] < 3:
         return False

@@ -26,8 +26,7 @@ def _union_error(
     for first in (i, j):
         leaf = first
         while leaf >= 0:
-            begin, end = int(np.int64(starts[leaf])), int(np.int64(starts[leaf + 1]))
-            total += error_terms(points, begin, end, m, variances, axes)
+            total += error_terms(points, starts[leaf], starts[leaf + 1], m, variances, axes)
             if total > enough:
                 return _NONE
             leaf = after[leaf]
@@ -68,15 +67,14 @@ def merge_leaves(
         for j in range(i + 1, n):
             if touches[i, j]:
                 errors[i, j] = _union_error(points, starts, after, moments, i, j, limit)
-    none = int(np.int64(-1))  # no literal: Numba would compile what is called for it, too
     while True:
-        a, b, best = none, none, limit
+        a, b, best = n, n, limit
         for i in range(n):
             if alive[i]:
                 for j in range(i + 1, n):
                     if errors[i, j] < best:
                         a, b, best = i, j, errors[i, j]
-        if a < 0:
+        if a == n:
             break
         moments[a] += moments[b]
         after[tail[a]] = b
@@ -116,4 +114,4 @@ def merge_frame(split: SplitFrame, limit: float) -> np.ndarray:
         Merged set of each leaf.
     """
     contacts = count_contacts(split.points, split.leaves, len(split.errors))
-    return merge_leaves(split.points, split.starts, split.moments, contacts, limit)
+    return merge_leaves(split.points, split.starts.astype(np.int64), split.moments, contacts, limit)

@@ -89,7 +89,12 @@ def benchmark() -> list[Row]:
     )
     labels = split.leaves
     contacts = count_contacts(split.points, labels, leaves)
-    kernel = measure(lambda: merge_leaves(split.points, split.starts, split.moments, contacts, settings.merge_error), 9)
+    kernel = measure(
+        lambda: merge_leaves(
+            split.points, split.starts.astype(np.int64), split.moments, contacts, settings.merge_error
+        ),
+        9,
+    )
     rows.append(
         Row(
             f"merge {leaves} leaves to {merge_frame(split, settings.merge_error).max() + 1}, contacts included",
