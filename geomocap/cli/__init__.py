@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
-import signal
 import sys
-from contextlib import suppress
 
 GARBAGE = 100_000  # objects made before those not needed are looked for: compiling and importing make many that stay
 
@@ -15,15 +13,14 @@ def main() -> None:
     """Run the command line; a mistake of the user's ends with one clear line and exit status 1."""
     from geomocap.cli.app import app
     from geomocap.cli.error_stream import own_lines_only
+    from geomocap.cli.interruption import interruptible
     from geomocap.errors import GeomocapError
     from geomocap.reading import reason
 
     gc.set_threshold(GARBAGE)
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # what it stumbles over, the one line says
-    with suppress(ValueError):  # not the main thread
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # asked to stop, whoever asks
     try:
-        with own_lines_only():
+        with interruptible(), own_lines_only():
             app()
     except GeomocapError as error:
         _fail(str(error))

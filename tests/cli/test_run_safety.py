@@ -141,18 +141,26 @@ def test_many_runs_in_one_process_hold_no_more(tmp_path):
     assert np.median(more) < 0.5  # MB; of no run's images or clouds may anything stay
 
 
-def test_a_process_that_is_asked_to_stop_says_one_line():
-    code = """
-import os, signal, time
-import geomocap.cli.app
+@pytest.mark.parametrize("wish", ["SIGTERM", "SIGINT"])
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_process_that_is_asked_to_stop_says_one_line(wish, lost):
+    code = f"""
+import os, signal, sys, time
+import geomocap.cli.info
 from geomocap.cli import main
 
-def work():
+def work(*options):
     import geomocap.model.rig  # with COLMAP's library, which has a handler of its own
-    os.kill(os.getpid(), signal.SIGTERM)
-    time.sleep(60)
+    try:
+        os.kill(os.getpid(), signal.{wish})
+        time.sleep(60)
+    except KeyboardInterrupt:
+        if {lost}:  # as modules that are just being imported
+            raise ImportError("initialization failed")
+        raise
 
-geomocap.cli.app.app = work
+geomocap.cli.info.foreign_calibration = work
+sys.argv = ["geomocap", "info", "."]
 main()
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
