@@ -99,12 +99,13 @@ class Scans:
         if len(points) > 1 and (points == points[0]).all():
             raise GeometryError(f"{name}: all {len(points)} points coincide; is the file right?")
         check_points(points, name)
-        away, diagonal = np.linalg.norm(points.mean(axis=0)), np.linalg.norm(np.ptp(points, axis=0))
-        if len(points) > 1 and away > _FARTHEST * diagonal:
-            raise GeometryError(
-                f"{name}: points lie {away / diagonal:.1e} times their diagonal from the origin, over {_FARTHEST:.0e}: "
-                "motions would get lost in rounding; subtract the same offset from all scans"
-            )
+        if len(points) > 1:
+            away, diagonal = np.linalg.norm(points.mean(axis=0)), np.linalg.norm(np.ptp(points, axis=0))
+            if away > _FARTHEST * diagonal:
+                raise GeometryError(
+                    f"{name}: points lie {away / diagonal:.1e} times their diagonal from the origin, over "
+                    f"{_FARTHEST:.0e}: motions would get lost in rounding; subtract the same offset from all scans"
+                )
         return surface
 
     def places(self, mesh: ScanSurface, frame: int) -> Places:

@@ -181,3 +181,8 @@ def test_bad_scans_are_named(tmp_path):
     np.savez(tmp_path / "e/0.npz", points=np.array([[0, 0, np.nan]]))
     with pytest.raises(GeometryError, match="all 1 points are missing"):
         open_scans(tmp_path / "e", ScanSettings()).points(0)
+
+
+def test_a_single_point_beyond_all_measure_is_no_number_trouble(tmp_path):
+    (tmp_path / "a.xyz").write_text("1e200 0 0\n")
+    np.testing.assert_array_equal(open_scans(tmp_path / "a.xyz", ScanSettings()).points(0), [[1e200, 0, 0]])
