@@ -100,7 +100,8 @@ class Scans:
             raise GeometryError(f"{name}: all {len(points)} points coincide; is the file right?")
         check_points(points, name)
         if len(points) > 1:
-            away, diagonal = np.linalg.norm(points.mean(axis=0)), np.linalg.norm(np.ptp(points, axis=0))
+            with np.errstate(over="ignore"):  # infinitely far is too far, too
+                away, diagonal = np.linalg.norm(points.mean(axis=0)), np.linalg.norm(np.ptp(points, axis=0))
             if away > _FARTHEST * diagonal:
                 raise GeometryError(
                     f"{name}: points lie {away / diagonal:.1e} times their diagonal from the origin, over "

@@ -186,3 +186,9 @@ def test_bad_scans_are_named(tmp_path):
 def test_a_single_point_beyond_all_measure_is_no_number_trouble(tmp_path):
     (tmp_path / "a.xyz").write_text("1e200 0 0\n")
     np.testing.assert_array_equal(open_scans(tmp_path / "a.xyz", ScanSettings()).points(0), [[1e200, 0, 0]])
+
+
+def test_points_that_share_a_coordinate_beyond_all_measure_are_refused(tmp_path):
+    (tmp_path / "a.xyz").write_text("1e200 0 0\n1e200 1 0\n1e200 0 1\n1e200 1 1\n")
+    with pytest.raises(GeometryError, match=r"a\.xyz.*times their diagonal from the origin"):
+        open_scans(tmp_path / "a.xyz", ScanSettings()).points(0)
