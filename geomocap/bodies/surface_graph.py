@@ -9,9 +9,10 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from geomocap.model.even_choice import evenly_chosen
 from geomocap.scheduling import spread
 
-FRAMES_LOOKED_AT = 20
+_FRAMES = 20  # looked at
 _FAR = np.float32(1e9)
 _BRIDGE = 3.0  # times the usual distance of neighbours
 
@@ -44,11 +45,6 @@ class SurfaceGraph:
     def geodesics(self, limit: float) -> np.ndarray:
         """Distances along the surface, (N, N) float, metres; infinite beyond the limit."""
         return dijkstra(self.adjacency, directed=False, limit=limit)
-
-
-def frames_looked_at(frames: int, most: int = FRAMES_LOOKED_AT) -> np.ndarray:
-    """Frames spread evenly over a sequence, first and last among them."""
-    return np.unique(np.linspace(0, frames - 1, min(frames, most)).round().astype(int))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -94,7 +90,7 @@ def lasting_distances(positions: np.ndarray) -> np.ndarray:
     -------
     (N, N) float32, metres
     """
-    looked_at = frames_looked_at(positions.shape[1])
+    looked_at = evenly_chosen(positions.shape[1], _FRAMES)
     rank = 3 if len(looked_at) >= 12 else 1
     result = np.zeros((len(positions), len(positions)), np.float32)
     some = np.ascontiguousarray(positions[:, looked_at], np.float64)

@@ -14,7 +14,8 @@ import numba
 import numpy as np
 
 from geomocap.bodies.rigid_motions import fit_rigid_motion
-from geomocap.bodies.surface_graph import SurfaceGraph, frames_looked_at
+from geomocap.bodies.surface_graph import SurfaceGraph
+from geomocap.model.even_choice import evenly_chosen
 from geomocap.model.motion_paths import sure_part
 from geomocap.model.rotations import nearest_rotation
 from geomocap.scheduling import spread
@@ -81,7 +82,7 @@ def surface_noise(
     graph : SurfaceGraph
     diagonal : float, metres
     """
-    looked_at = frames_looked_at(positions.shape[1], _FRAMES)
+    looked_at = evenly_chosen(positions.shape[1], _FRAMES)
     positions, weights = np.ascontiguousarray(positions[:, looked_at]), np.ascontiguousarray(weights[:, looked_at])
     outer = max(_RING[1] * diagonal, _SPACINGS * graph.spacing)
     geodesics = graph.geodesics(outer)

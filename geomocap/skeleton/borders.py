@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geomocap.bodies.motion_bodies import MotionBodies
-from geomocap.bodies.surface_graph import frames_looked_at
+from geomocap.model.even_choice import evenly_chosen
 
 _NEAREST = 6  # samples of a body that are on the border in any case
 _FRAMES = 10  # looked at
@@ -96,7 +96,7 @@ def find_borders(bodies: MotionBodies, limit: float) -> dict[tuple[int, int], Bo
     apart = bodies.lasting + np.diag(np.full(len(bodies.lasting), np.inf, np.float32))
     spacing = float(np.median(apart.min(axis=1)))
     members = [np.flatnonzero(bodies.label == b) for b in range(count)]
-    looked_at = frames_looked_at(bodies.positions.shape[1], _FRAMES)
+    looked_at = evenly_chosen(bodies.positions.shape[1], _FRAMES)
     moved = [bodies.positions[m][:, looked_at] for m in members]
     trees = [[cKDTree(part[:, f]) for f in range(len(looked_at))] for part in moved]
     borders = {}
