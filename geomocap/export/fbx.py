@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -26,6 +27,8 @@ bpy.context.scene.frame_start, bpy.context.scene.frame_end = 0, round(last)
 bpy.ops.export_scene.fbx(filepath=sys.argv[-2], add_leaf_bones=False, bake_anim_simplify_factor=0.0)
 """
 
+_ERROR = re.compile(r"\w+(Error|Exception): ")  # of Blender's Python, which may take several lines
+
 
 def write_fbx(path: Path, glb: Path, fps: float) -> None:
     """Convert a GLB into an FBX, whole or not at all.
@@ -42,10 +45,10 @@ def write_fbx(path: Path, glb: Path, fps: float) -> None:
     MotionError
         If Blender fails.
     """
-    write_atomic(path, lambda p: _convert(p, glb, fps))
+    write_atomic(path, lambda p: _convert(p, glb, fps, path.name))
 
 
-def _convert(path: Path, glb: Path, fps: float) -> None:
+def _convert(path: Path, glb: Path, fps: float, name: str) -> None:
     program = shutil.which("blender")
     if program is not None:
         start = [program, "--background", "--factory-startup", "--python-exit-code", "1", "--python-expr", SCRIPT, "--"]
@@ -57,5 +60,6 @@ def _convert(path: Path, glb: Path, fps: float) -> None:
         )
     done = subprocess.run([*start, str(glb.resolve()), str(path.resolve()), f"{fps:g}"], capture_output=True, text=True)
     if done.returncode or not path.is_file():
-        said = (done.stderr.strip() or done.stdout.strip() or "it said nothing").splitlines()[-1]
-        raise MotionError(f"{path.name}: Blender could not write it ({said}); import motion.glb instead")
+        lines = (done.stderr.strip() or done.stdout.strip() or "it said nothing").splitlines()
+        said = next((line for line in reversed(lines) if _ERROR.match(line)), lines[-1])
+        raise MotionError(f"{name}: Blender could not write it ({said}); import motion.glb instead")

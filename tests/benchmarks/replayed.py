@@ -227,7 +227,8 @@ def exported(path: Path, folder: Path) -> Motion:
     settings = run_settings(run)
     names, _ = run_names(run, skeleton, up, settings)
     formats = ["bvh", "trc", "glb", "osim", "urdf"]
-    formats += [f for f, package in (("c3d", "ezc3d"), ("movement", "xarray"), ("fbx", "bpy")) if find_spec(package)]
+    formats += [f for f, package in (("c3d", "ezc3d"), ("movement", "xarray")) if find_spec(package)]
+    formats += ["fbx"] if find_spec("bpy") or shutil.which("blender") else []
     export_run(run, formats, ExportSettings(**settings.model_dump()), folder=folder)
     shutil.copy(path / "run.toml", folder)
     bodies = names.body_names(skeleton.body_count, skeleton.body_names)

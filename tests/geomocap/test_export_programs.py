@@ -52,7 +52,7 @@ def test_blender_is_given_the_files_and_its_failure_is_told(tmp_path, monkeypatc
     """Stands in for Blender: copies the file before the last but one of its arguments, or fails."""
     program = tmp_path / "bin" / "blender"
     program.parent.mkdir()
-    fail = "" if works else "echo 'no add-on' >&2; exit 1\n"
+    fail = "" if works else "printf 'Traceback\\nImportError: no add-on\\nsee its pages' >&2; exit 1\n"
     program.write_text(f'#!/bin/sh\n{fail}while [ $# -gt 3 ]; do shift; done\n/bin/cp "$1" "$2"\n')
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setenv("PATH", str(program.parent))
@@ -62,6 +62,6 @@ def test_blender_is_given_the_files_and_its_failure_is_told(tmp_path, monkeypatc
         write_fbx(tmp_path / "motion.fbx", glb, 25.0)
         assert (tmp_path / "motion.fbx").read_bytes() == b"glTF"
     else:
-        with pytest.raises(MotionError, match="no add-on"):
+        with pytest.raises(MotionError, match=r"^motion\.fbx: Blender could not write it \(ImportError: no add-on\)"):
             write_fbx(tmp_path / "motion.fbx", glb, 25.0)
         assert not list(tmp_path.glob("*fbx"))
