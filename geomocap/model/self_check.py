@@ -72,10 +72,10 @@ class SelfCheck:
         mean = _mean(self.model)
         if mean < GOOD:
             reasons.append(
-                f"the model, drawn into the cameras, agrees with {mean:.0%} of what they see (over {GOOD:.0%} is good)"
+                f"The model, drawn into the cameras, agrees with {mean:.0%} of what they see (over {GOOD:.0%} is good)."
             )
         if self.contradicting:
-            reasons.append(f"the silhouettes of {', '.join(self.contradicting)} contradict the other cameras")
+            reasons.append(f"The silhouettes of {', '.join(self.contradicting)} contradict the other cameras.")
         if not reasons:
             return "trust it", ()
         return ("don't use it" if mean < POOR else "check it"), tuple(reasons)
