@@ -63,6 +63,17 @@ def blender() -> list[str]:
     pytest.skip("neither Blender nor the package bpy is installed")
 
 
+def check_answered(answer: Path, done: subprocess.CompletedProcess[str]) -> None:
+    """Fail with what Blender said if it gave no answer; skip where its own glTF add-on doesn't suit its NumPy.
+
+    Debian 12's Blender 3.4 asks for `numpy.bool`, which Debian 12's NumPy 1.24 no longer has.
+    """
+    said = done.stdout[-4000:] + done.stderr[-4000:]
+    if not answer.is_file() and "io_scene_gltf2" in said and "module 'numpy' has no attribute 'bool'" in said:
+        pytest.skip("this Blender's glTF add-on doesn't suit its NumPy (numpy.bool): it can read no GLB at all")
+    assert answer.is_file(), said
+
+
 @pytest.mark.slow
 def test_a_run_is_imported_as_it_is(tmp_path: Path) -> None:
     command = blender()
@@ -78,7 +89,7 @@ def test_a_run_is_imported_as_it_is(tmp_path: Path) -> None:
     more = [str(ROOT / "tools"), str(made.run.path), json.dumps(points), str(answer)]
     between = ["--"] if command[-1] == "--python" else []
     done = subprocess.run([*command, str(script), *between, *more], capture_output=True, text=True, timeout=300)
-    assert answer.is_file(), done.stdout[-2000:] + done.stderr[-2000:]
+    check_answered(answer, done)
     found = json.loads(answer.read_text())
 
     assert found["result"] == ["FINISHED"] and len(found["meshes"]) == 1

@@ -14,7 +14,7 @@ from geomocap.export.run_export import export_run
 from geomocap.files.run import Run
 from geomocap.naming.name_templates import read_template
 from tests.geomocap.template_figures import figure
-from tests.tools.test_blender_addon import blender
+from tests.tools.test_blender_addon import blender, check_answered
 
 # A person in a T pose as animators build them, facing -y: other proportions, bones in between, any roll about bones.
 SCRIPT = """
@@ -90,7 +90,7 @@ def retargeted(glb: Path, tmp_path: Path) -> dict:
     done = subprocess.run(
         [*command, str(script), *between, str(glb), str(answer)], capture_output=True, text=True, timeout=300
     )
-    assert answer.is_file(), done.stdout[-2000:] + done.stderr[-2000:]
+    check_answered(answer, done)
     return json.loads(answer.read_text())
 
 
