@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from geomocap.export.export_errors import MotionError
 from geomocap.export.export_settings import ExportSettings
 from geomocap.export.run_export import export_run, run_settings, run_up
 from geomocap.export.run_names import run_names
@@ -228,8 +229,12 @@ def exported(path: Path, folder: Path) -> Motion:
     names, _ = run_names(run, skeleton, up, settings)
     formats = ["bvh", "trc", "glb", "osim", "urdf"]
     formats += [f for f, package in (("c3d", "ezc3d"), ("movement", "xarray")) if find_spec(package)]
-    formats += ["fbx"] if find_spec("bpy") or shutil.which("blender") else []
-    export_run(run, formats, ExportSettings(**settings.model_dump()), folder=folder)
+    chosen = ExportSettings(**settings.model_dump())
+    export_run(run, formats, chosen, folder=folder)
+    try:
+        export_run(run, ["fbx"], chosen, folder=folder)
+    except MotionError as error:  # no Blender, or one that reads no GLB
+        print(f"FBX is left out: {error}")
     shutil.copy(path / "run.toml", folder)
     bodies = names.body_names(skeleton.body_count, skeleton.body_names)
     return Motion(
