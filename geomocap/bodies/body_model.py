@@ -157,6 +157,16 @@ class BodyModel:
         result[rows[~blended], self.label[~blended]] = 1.0
         return result
 
+    def carry(self, rest: np.ndarray) -> np.ndarray:
+        """Samples (N, 3), metres, carried by what they follow: (N, T, 3)."""
+        memberships = self.memberships()
+        carried = np.zeros((len(rest), self.rotations.shape[1], 3))
+        for b in range(self.count):
+            some = np.flatnonzero(memberships[:, b] > 0)
+            moved = carry(self.rotations[b], self.translations[b], rest[some])
+            carried[some] += memberships[some, b][:, None, None] * moved
+        return carried
+
     def compact(self) -> BodyModel:
         """Leave out bodies without samples."""
         used, label = np.unique(self.label, return_inverse=True)

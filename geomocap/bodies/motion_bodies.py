@@ -9,27 +9,18 @@ from scipy.sparse import csr_matrix
 
 from geomocap.bodies.body_elimination import EliminationStep, confidences, eliminate
 from geomocap.bodies.body_evidence import Criterion
-from geomocap.bodies.body_model import BodyModel, Evidence, carry, model_of_labels, reassign, refit, settle_rest
+from geomocap.bodies.body_model import BodyModel, Evidence, reassign
 from geomocap.bodies.body_settings import MotionBodiesSettings
-from geomocap.bodies.connected_linkage import Dendrogram, connected_linkage
-from geomocap.bodies.local_rotations import local_rotations, turn_distances
-from geomocap.bodies.path_smoothing import smooth_paths
-from geomocap.bodies.surface_graph import SurfaceGraph, surface_graph
-from geomocap.bodies.surface_noise import SurfaceNoise, surface_noise
+from geomocap.bodies.connected_linkage import Dendrogram
+from geomocap.bodies.first_bodies import STAGE, FirstBodies, first_bodies
+from geomocap.bodies.surface_noise import SurfaceNoise
 from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths, sure_part
 from geomocap.progress import Progress, silent
 from geomocap.trajectories.completion import complete_tracks
 
 _LEAST_SAMPLES = 20
-_CERTAIN = 0.3
-_SETTLE_ROUNDS = 3
-_EARLY_FRACTION = 0.8  # small groups may still grow
 _IS_ONE = 0.5  # confidence of a body that explains just what is required
-_FEIGNED = 7.81  # 95th percentile of χ² of the three angles of a turn by noise
-_ARM = 0.4  # radii
-_MOST_RADIUS = 3.0  # times the radius asked for
-_STAGE = "bodies"
 
 
 @dataclass(frozen=True)
@@ -120,10 +111,12 @@ def find_motion_bodies(
 
     Every sample's neighbourhood on the surface has a rotation since frame 0, whatever lever arms there are. Samples
     that turn alike are grouped (average linkage along the surface), too finely, unless the paths say which rigid parts
-    they are of. Each group gets a rigid motion, each sample follows one body or a blend of two, and then the weakest
-    body goes, again and again, until each one left turns against its neighbours and pays for its freedoms: it explains
-    motion that blends of the neighbours do not, beyond the noise that is everywhere on the surface and the softness of
-    skin (`body_evidence`). A rigid part was registered on its own: it is no skin, and its turn is known better.
+    they are of. Gaps, filled from frame to frame by neighbours, are filled anew by the motion of these groups, the more
+    so the longer they are, and the groups found once more: errors don't add up along a gap. Each sample follows one
+    body or a blend of two, and then the weakest body goes, again and again, until each one left turns against its
+    neighbours and pays for its freedoms: it explains motion that blends of the neighbours do not, beyond the noise that
+    is everywhere on the surface and the softness of skin (`body_evidence`). A rigid part was registered on its own:
+    it is no skin, and its turn is known better.
 
     Parameters
     ----------
@@ -143,35 +136,19 @@ def find_motion_bodies(
     settings = settings or MotionBodiesSettings()
     if paths.count < _LEAST_SAMPLES:
         raise GeometryError(f"motion paths: {paths.count} samples; at least {_LEAST_SAMPLES} are needed to find bodies")
-    diagonal = paths.diagonal
-    # Paths without gaps, the surface, and how it turns
-    positions, certainty = complete_tracks(paths)
-    weights = np.where(paths.seen, paths.weights(), 0.1 * certainty)
-    smooth = smooth_paths(positions)
-    reference = smooth[:, 0]  # of samples that are not seen there, as their neighbours carry them back
-    graph = surface_graph(smooth, reference, settings.neighbours, settings.max_stretch)
-    noise = surface_noise(smooth, weights, reference, paths.ray, graph, diagonal)
-    progress(_STAGE, 1, 4)
-    first_cut = np.deg2rad(settings.first_cut_deg)
-    geodesics, radius = _wide_enough(graph, noise, max(settings.radius * diagonal, 2.5 * graph.spacing), first_cut)
-    rotations = local_rotations(smooth, reference, weights, geodesics, radius)
-    turns = turn_distances(_known_rotations(paths, rotations), certainty > _CERTAIN)
-    progress(_STAGE, 2, 4)
     # Too many bodies
-    evidence = _evidence(smooth, weights, paths, reference, turns, graph, diagonal, settings)
-    linkage = connected_linkage(turns, graph.neighbours)
-    least = max(6, round(_EARLY_FRACTION * settings.min_fraction * paths.count))
-    label = absorb_small(linkage.cut(first_cut) if paths.parts is None else paths.parts, turns, graph, least)
-    if settings.bodies > int(label.max()) + 1:
-        label = linkage.cut_count(settings.bodies)
-    model, evidence = _settled(reassign(model_of_labels(label, evidence), evidence, 4).compact(), evidence)
-    progress(_STAGE, 3, 4)
+    positions, certainty = complete_tracks(paths)
+    first = first_bodies(positions, certainty, paths, settings, progress)
+    if paths.ray is None and not paths.seen.all():
+        sure = certainty[..., None]
+        positions = sure * positions + (1.0 - sure) * first.model.carry(first.evidence.rest)
+        first = first_bodies(positions, certainty, paths, settings, progress)
     # Those that are there
-    criterion = _criterion(settings, noise, rigid=paths.parts is not None)
-    model, evidence, curve, confidence = _those_that_are_there(model, evidence, criterion, settings.bodies)
-    progress(_STAGE, 4, 4)
+    criterion = _criterion(settings, first.noise, rigid=paths.parts is not None)
+    model, evidence, curve, confidence = _those_that_are_there(first.model, first.evidence, criterion, settings.bodies)
+    progress(STAGE, 4, 4)
     evidence = replace(evidence, positions=positions)
-    return _result(model, evidence, paths, graph, curve, linkage, diagonal, confidence, noise)
+    return _result(model, evidence, paths, first, curve, confidence)
 
 
 def _those_that_are_there(
@@ -197,114 +174,16 @@ def _criterion(settings: MotionBodiesSettings, noise: SurfaceNoise, rigid: bool)
     return Criterion(np.deg2rad(turn), noise, settings.min_fraction, softness)
 
 
-def _wide_enough(graph: SurfaceGraph, noise: SurfaceNoise, radius: float, first_cut: float) -> tuple[np.ndarray, float]:
-    """Geodesics and radius of neighbourhoods so large that their turns by noise are less than those of the first cut.
-
-    Gaussian weights leave a disc of radius r an arm of 0.4 r about each axis, so that noise of standard deviation σ
-    turns n samples by σ / (√n 0.4 r) about it, and two such discs against each other by √2 times that.
-    """
-    most = _MOST_RADIUS * radius
-    while True:
-        geodesics = graph.geodesics(radius)
-        samples = float(np.median((geodesics <= radius).sum(axis=1)))
-        feigned = np.sqrt(_FEIGNED * 2.0 * noise.variance / 3.0 / samples) / (_ARM * radius)
-        if feigned < first_cut or 1.25 * radius > most:
-            return geodesics, radius
-        radius *= 1.25
-
-
-def _settled(model: BodyModel, evidence: Evidence) -> tuple[BodyModel, Evidence]:
-    """Places at rest from all frames, by the first bodies: frame 0 is as noisy as any other.
-
-    From then on all bodies carry the same shape; only samples that were not seen in frame 0, or not surely, may lie
-    elsewhere for another body.
-    """
-    for _ in range(_SETTLE_ROUNDS):
-        settled = settle_rest(model, evidence.with_places_open())
-        evidence = replace(evidence, rest=settled.rest)
-        model = reassign(refit(model, settled, np.arange(model.count)), settled, 1).compact()
-    return reassign(refit(model, evidence, np.arange(model.count)), evidence, 1).compact(), evidence
-
-
-def _known_rotations(paths: MotionPaths, fitted: np.ndarray) -> np.ndarray:
-    if paths.rotations is None:
-        return fitted
-    known = np.isfinite(paths.rotations).all(axis=(2, 3))
-    return np.where(known[..., None, None], paths.rotations, fitted)
-
-
-def _evidence(
-    positions: np.ndarray,
-    weights: np.ndarray,
-    paths: MotionPaths,
-    rest: np.ndarray,
-    turns: np.ndarray,
-    graph: SurfaceGraph,
-    diagonal: float,
-    settings: MotionBodiesSettings,
-) -> Evidence:
-    near = csr_matrix(np.isfinite(graph.geodesics(max(settings.reach * diagonal, 3.0 * graph.spacing))).astype(float))
-    certain = paths.seen[:, 0] if paths.ray is None else paths.seen[:, 0] & ~paths.ray[:, 0].any(axis=1)
-    return Evidence(
-        positions,
-        weights,
-        paths.seen,
-        paths.typical_sigma(),
-        paths.ray,
-        rest,
-        certain,
-        turns,
-        _unevenness(turns, graph.adjacency),
-        graph.adjacency,
-        near,
-        settings.blend_penalty * diagonal if settings.blends else np.inf,
-        settings.largest_residual * diagonal,
-        2e-4 * diagonal,
-        settings.smoothness,
-    )
-
-
-def _unevenness(turns: np.ndarray, adjacency: csr_matrix) -> np.ndarray:
-    beside = np.split(adjacency.indices, adjacency.indptr[1:-1])
-    return np.array([np.median(turns[i, others]) if len(others) else 0.0 for i, others in enumerate(beside)])
-
-
-def absorb_small(label: np.ndarray, turns: np.ndarray, graph: SurfaceGraph, least: int) -> np.ndarray:
-    """Give groups of fewer samples to the neighbouring group that turns most alike, the smallest first."""
-    label = label.copy()
-    linked = graph.neighbours
-    while True:
-        groups, counts = np.unique(label, return_counts=True)
-        if counts.min() >= least or len(groups) == 1:
-            return np.unique(label, return_inverse=True)[1]
-        small = label == groups[np.argmin(counts)]
-        others = np.unique(label[linked[small].any(axis=0) & ~small])
-        if not len(others):
-            outside = np.flatnonzero(~small)
-            nearest = graph.lasting[np.ix_(small, outside)].min(axis=0).argmin()
-            others = label[outside[[nearest]]]
-        differences = [np.median(turns[np.ix_(small, label == g)]) for g in others]
-        label[small] = others[int(np.argmin(differences))]
-
-
 def _result(
     model: BodyModel,
     evidence: Evidence,
     paths: MotionPaths,
-    graph: SurfaceGraph,
+    found_from: FirstBodies,
     curve: tuple[EliminationStep, ...],
-    linkage: Dendrogram,
-    diagonal: float,
     confidence: np.ndarray,
-    noise: SurfaceNoise,
 ) -> MotionBodies:
-    memberships = model.memberships()
-    carried = np.zeros_like(evidence.positions)
-    for b in range(model.count):
-        some = np.flatnonzero(memberships[:, b] > 0)
-        moved = carry(model.rotations[b], model.translations[b], evidence.rest[some])
-        carried[some] += memberships[some, b][:, None, None] * moved
-    miss = np.linalg.norm(sure_part(carried - evidence.positions, evidence.ray), axis=2)
+    memberships, diagonal = model.memberships(), paths.diagonal
+    miss = np.linalg.norm(sure_part(model.carry(evidence.rest) - evidence.positions, evidence.ray), axis=2)
     total = np.maximum(evidence.weights.sum(axis=1), 1e-12)
     residuals = np.sqrt((evidence.weights * miss**2).sum(axis=1) / total)
     follows = paths.seen & (miss < max(4.0 * float(np.median(residuals)), 0.005 * diagonal))
@@ -323,12 +202,12 @@ def _result(
         rest,
         evidence.positions,
         residuals,
-        graph.lasting,
-        graph.adjacency,
+        found_from.graph.lasting,
+        found_from.graph.adjacency,
         curve,
-        linkage,
+        found_from.linkage,
         diagonal,
         float(np.median(evidence.unevenness)),
         confidence,
-        float(np.sqrt(noise.variance)),
+        float(np.sqrt(found_from.noise.variance)),
     )
