@@ -118,7 +118,9 @@ class ImageMotion:
             starts = [_carried(geometric[t - way], geometric[t], states[-1], g.spacing)]
             if len(states) > 1:
                 starts.insert(0, _continued(states[-2], states[-1]))
-            starts.append(_with_limbs(starts[0], geometric[t], self._apart(starts[0], geometric[t])))
+            elsewhere = self._apart(starts[0], geometric[t])
+            if elsewhere.any():
+                starts.append(_with_limbs(starts[0], geometric[t], elsewhere))
             marks = marks_of(t)
             starts = [marks.move(g, *start, self.give, self._scale()) for start in starts]
             found = [self._fit(frames[t], images, earlier, marks, start, 0) for start in starts]
@@ -285,8 +287,8 @@ class ImageMotion:
             mean = total / np.maximum(count, 1)
             usual = max(float(np.median(mean[known])), _LEAST)
             weight = np.where(known, once / (1 + mean / (_DEPARTED * usual)) ** 2, 0.0) * noise**2 / usual
-            A += (weight[..., None, None] * more).sum(axis=1)
-            b += (weight[..., None] * pulled).sum(axis=1)
+            A += (weight[:, None] @ more.reshape(S, C, 9)).reshape(S, 3, 3)
+            b += (weight[:, None] @ pulled)[:, 0]
             errors[k][known] = mean[known]
         return errors
 

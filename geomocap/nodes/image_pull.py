@@ -142,6 +142,15 @@ def _value(image, x, y):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _project_window(P, y, e, step, middle, row, column):
+    """Homogeneous place of a window's middle and steps of its rows and columns, (3,) each, by a projection (3, 4)."""
+    for k in range(3):
+        middle[k] = P[k, 0] * y[0] + P[k, 1] * y[1] + P[k, 2] * y[2] + P[k, 3]
+        row[k] = step * (P[k, 0] * e[0, 0] + P[k, 1] * e[0, 1] + P[k, 2] * e[0, 2])
+        column[k] = step * (P[k, 0] * e[1, 0] + P[k, 1] * e[1, 1] + P[k, 2] * e[1, 2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def window_pulls(now, then, P, Q, mask_now, mask_then, y, e, y0, e0, step, seen, half, A, b, error, count):
     """Gather what the windows of all samples in all cameras ask, with σ = 1.
 
@@ -171,46 +180,58 @@ def window_pulls(now, then, P, Q, mask_now, mask_then, y, e, y0, e0, step, seen,
     size = (2 * half + 1) ** 2
     g = np.empty((size, 3))
     r = np.empty(size)
+    # places on the images are quotients of what is linear in the window's rows and columns
+    o0, i0, j0 = np.empty(3), np.empty(3), np.empty(3)
+    o1, i1, j1 = np.empty(3), np.empty(3), np.empty(3)
+    height, width = mask_now.shape[1:]
+    height0, width0 = mask_then.shape[1:]
     for s in range(len(y)):
         for c in range(len(P)):
             count[s, c] = 0
             if not seen[s, c]:
                 continue
-            height, width = mask_now.shape[1:]
-            height0, width0 = mask_then.shape[1:]
+            _project_window(Q[c], y0[s], e0[s], step[s, c], o0, i0, j0)
+            _project_window(P[c], y[s], e[s], step[s, c], o1, i1, j1)
+            image = now[c]
             n = 0
             mr, m0, m1, m2 = 0.0, 0.0, 0.0, 0.0
             for i in range(-half, half + 1):
                 for j in range(-half, half + 1):
-                    di, dj = step[s, c] * i, step[s, c] * j
-                    X = y0[s, 0] + di * e0[s, 0, 0] + dj * e0[s, 1, 0]
-                    Y = y0[s, 1] + di * e0[s, 0, 1] + dj * e0[s, 1, 1]
-                    Z = y0[s, 2] + di * e0[s, 0, 2] + dj * e0[s, 1, 2]
-                    w = Q[c, 2, 0] * X + Q[c, 2, 1] * Y + Q[c, 2, 2] * Z + Q[c, 2, 3]
+                    w = o0[2] + i * i0[2] + j * j0[2]
                     if w <= 0:
                         continue
-                    u = (Q[c, 0, 0] * X + Q[c, 0, 1] * Y + Q[c, 0, 2] * Z + Q[c, 0, 3]) / w
-                    v = (Q[c, 1, 0] * X + Q[c, 1, 1] * Y + Q[c, 1, 2] * Z + Q[c, 1, 3]) / w
+                    w = 1.0 / w
+                    u, v = w * (o0[0] + i * i0[0] + j * j0[0]), w * (o0[1] + i * i0[1] + j * j0[1])
                     if not (u >= 0 and v >= 0 and u < width0 - 1 and v < height0 - 1):
                         continue
                     if mask_then[c, int(v + 0.5), int(u + 0.5)] == 0:
                         continue
                     before = _value(then[c], u, v)
-                    X = y[s, 0] + di * e[s, 0, 0] + dj * e[s, 1, 0]
-                    Y = y[s, 1] + di * e[s, 0, 1] + dj * e[s, 1, 1]
-                    Z = y[s, 2] + di * e[s, 0, 2] + dj * e[s, 1, 2]
-                    w = P[c, 2, 0] * X + P[c, 2, 1] * Y + P[c, 2, 2] * Z + P[c, 2, 3]
+                    w = o1[2] + i * i1[2] + j * j1[2]
                     if w <= 0:
                         continue
-                    u = (P[c, 0, 0] * X + P[c, 0, 1] * Y + P[c, 0, 2] * Z + P[c, 0, 3]) / w
-                    v = (P[c, 1, 0] * X + P[c, 1, 1] * Y + P[c, 1, 2] * Z + P[c, 1, 3]) / w
+                    w = 1.0 / w
+                    u, v = w * (o1[0] + i * i1[0] + j * j1[0]), w * (o1[1] + i * i1[1] + j * j1[1])
                     if not (u >= 1 and v >= 1 and u < width - 2 and v < height - 2):
                         continue
                     if mask_now[c, int(v + 0.5), int(u + 0.5)] == 0:
                         continue
-                    gx = 0.5 * (_value(now[c], u + 1, v) - _value(now[c], u - 1, v)) / w
-                    gy = 0.5 * (_value(now[c], u, v + 1) - _value(now[c], u, v - 1)) / w
-                    r[n] = _value(now[c], u, v) - before
+                    # value and half the central differences there, all bilinear
+                    row, col = int(v), int(u)
+                    a, d = u - col, v - row
+                    p, q = 1 - a, 1 - d
+                    f00, f01, f10, f11 = (
+                        image[row, col],
+                        image[row, col + 1],
+                        image[row + 1, col],
+                        image[row + 1, col + 1],
+                    )
+                    r[n] = q * (p * f00 + a * f01) + d * (p * f10 + a * f11) - before
+                    gx = q * (p * (f01 - image[row, col - 1]) + a * (image[row, col + 2] - f00))
+                    gx += d * (p * (f11 - image[row + 1, col - 1]) + a * (image[row + 1, col + 2] - f10))
+                    gy = p * (q * (f10 - image[row - 1, col]) + d * (image[row + 2, col] - f00))
+                    gy += a * (q * (f11 - image[row - 1, col + 1]) + d * (image[row + 2, col + 1] - f01))
+                    gx, gy = 0.5 * gx * w, 0.5 * gy * w
                     for k in range(3):
                         g[n, k] = gx * (P[c, 0, k] - u * P[c, 2, k]) + gy * (P[c, 1, k] - v * P[c, 2, k])
                     mr += r[n]
