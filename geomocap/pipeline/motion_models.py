@@ -57,17 +57,25 @@ def has_unseen(motion: Motion) -> bool:
     return not (motion.bodies.reliability > 0).all()
 
 
+def silhouette_overlap(job: Job, model: SubjectModel, motion: Motion) -> float:
+    """Draw a motion's model into the cameras: its overlap with the silhouettes, see `Explanation`."""
+    assert job.capture is not None
+    return model_overlap(job.run, job.capture, model, motion.skeleton)
+
+
 def explain_silhouettes(
-    job: Job, geometry: Geometry, model: SubjectModel, motion: Motion, paths: MotionPaths
+    job: Job, geometry: Geometry, model: SubjectModel, motion: Motion, paths: MotionPaths, before: float | None = None
 ) -> Explanation:
-    """Draw a motion's model into the cameras; fit it to the surfaces of all frames if no path shows some body in some.
+    """Fit a motion's model to the surfaces of all frames if no path shows some body in some frame.
 
     The fit is kept if the model then overlaps the silhouettes more, by at least what the smallest piece of a surface
-    is: a surface alone knows less than paths do where these are. `paths` are those that the motion was found from.
+    is: a surface alone knows less than paths do where these are. `paths` are those that the motion was found from,
+    `before` the overlap without a fit, where it is known.
     """
     assert job.capture is not None
     found = motion.skeleton
-    before = model_overlap(job.run, job.capture, model, found)
+    if before is None:
+        before = silhouette_overlap(job, model, motion)
     if not has_unseen(motion):
         return Explanation(before)
     start = joint_motion(model.linkage, found.body_rotations, found.root_positions)

@@ -12,11 +12,10 @@ from geomocap.files.run import Run
 from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.ellipsoids import Ellipsoids, fit_ellipsoids
 from geomocap.model.frame_geometry import BodyPoints, Geometry
-from geomocap.model.motion_paths import MotionPaths
 from geomocap.motion import Motion, MotionSettings, find_motion
 from geomocap.pipeline.following_stage import write_followed
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.motion_models import Explanation, explain_silhouettes, has_unseen, make_model
+from geomocap.pipeline.motion_models import explain_silhouettes, has_unseen, make_model, silhouette_overlap
 from geomocap.pipeline.outline_reading import outlines_of
 from geomocap.pipeline.path_choice import motion_paths
 from geomocap.scheduling import map_items
@@ -37,18 +36,18 @@ class _Candidate:
     motion : Motion
     model : SubjectModel or str
         In words why, if it can't be made.
-    explanation : Explanation, optional
-        Of the silhouettes; None where nothing depends on it.
+    overlap : float, optional
+        Of the model with the silhouettes; None where nothing depends on it.
     """
 
     motion: Motion
     model: SubjectModel | str
-    explanation: Explanation | None
+    overlap: float | None
 
     @property
     def worth(self) -> float:
         """Overlap with the silhouettes less the price of the bodies."""
-        return (self.explanation.overlap if self.explanation else 0.0) - _BODY_PRICE * self.motion.body_count
+        return (self.overlap or 0.0) - _BODY_PRICE * self.motion.body_count
 
 
 def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
@@ -69,10 +68,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
             for source, paths in choice.items()
         }
         count["items"] = frames
-    candidates = {
-        source: _candidate(job, geometry, motion, choice[source], len(choice) > 1)
-        for source, motion in found_from.items()
-    }
+    candidates = {source: _candidate(job, geometry, motion, len(choice) > 1) for source, motion in found_from.items()}
     source = max(candidates, key=lambda which: candidates[which].worth)
     best = candidates[source]
     motion, model = best.motion, best.model
@@ -88,8 +84,10 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
         warnings.append(model)
     else:
         write_model(job.run.path / MODEL_FILE, model)
-        if best.explanation is not None and best.explanation.fit is not None:
-            fit = best.explanation.fit
+        fit = None
+        if job.capture is not None and has_unseen(motion):
+            fit = explain_silhouettes(job, geometry, model, motion, choice[source], best.overlap).fit
+        if fit is not None:
             write_followed(job, geometry, model, fit)
             axes = posed(model.linkage, fit, 0).axes
             unseen = int((bodies.reliability == 0).any(axis=1).sum())
@@ -117,12 +115,12 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     return frames
 
 
-def _candidate(job: Job, geometry: Geometry, motion: Motion, paths: MotionPaths, several: bool) -> _Candidate:
-    """Make the model of a motion, and see how well it explains the silhouettes where that decides something."""
+def _candidate(job: Job, geometry: Geometry, motion: Motion, several: bool) -> _Candidate:
+    """Make the model of a motion, and see how well it explains the silhouettes where there are other motions."""
     model = make_model(job, geometry, motion)
-    if job.capture is None or isinstance(model, str) or not (several or has_unseen(motion)):
+    if job.capture is None or isinstance(model, str) or not several:
         return _Candidate(motion, model, None)
-    return _Candidate(motion, model, explain_silhouettes(job, geometry, model, motion, paths))
+    return _Candidate(motion, model, silhouette_overlap(job, model, motion))
 
 
 @dataclass(frozen=True)
