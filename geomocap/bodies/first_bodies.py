@@ -15,9 +15,7 @@ from geomocap.bodies.path_smoothing import smooth_paths
 from geomocap.bodies.surface_graph import SurfaceGraph, surface_graph
 from geomocap.bodies.surface_noise import SurfaceNoise, surface_noise
 from geomocap.model.motion_paths import MotionPaths
-from geomocap.progress import Progress
 
-STAGE = "bodies"
 _CERTAIN = 0.3
 _SETTLE_ROUNDS = 3
 _EARLY_FRACTION = 0.8  # small groups may still grow
@@ -49,11 +47,7 @@ class FirstBodies:
 
 
 def first_bodies(
-    positions: np.ndarray,
-    certainty: np.ndarray,
-    paths: MotionPaths,
-    settings: MotionBodiesSettings,
-    progress: Progress,
+    positions: np.ndarray, certainty: np.ndarray, paths: MotionPaths, settings: MotionBodiesSettings
 ) -> FirstBodies:
     """Find groups of samples that turn alike, too finely, and the motion of these.
 
@@ -63,7 +57,6 @@ def first_bodies(
         Without gaps, and how sure the positions are: 1 where seen.
     paths : MotionPaths
     settings : MotionBodiesSettings
-    progress : Progress
     """
     diagonal = paths.diagonal
     weights = np.where(paths.seen, paths.weights(), 0.1 * certainty)
@@ -71,12 +64,10 @@ def first_bodies(
     reference = smooth[:, 0]  # of samples that are not seen there, as their neighbours carry them back
     graph = surface_graph(smooth, reference, settings.neighbours, settings.max_stretch)
     noise = surface_noise(smooth, weights, reference, paths.ray, graph, diagonal)
-    progress(STAGE, 1, 4)
     first_cut = np.deg2rad(settings.first_cut_deg)
     geodesics, radius = _wide_enough(graph, noise, max(settings.radius * diagonal, 2.5 * graph.spacing), first_cut)
     rotations = local_rotations(smooth, reference, weights, geodesics, radius)
     turns = turn_distances(_known_rotations(paths, rotations), certainty > _CERTAIN)
-    progress(STAGE, 2, 4)
     evidence = _evidence(smooth, weights, paths, reference, turns, graph, diagonal, settings)
     linkage = connected_linkage(turns, graph.neighbours)
     least = max(6, round(_EARLY_FRACTION * settings.min_fraction * paths.count))
@@ -84,7 +75,6 @@ def first_bodies(
     if settings.bodies > int(label.max()) + 1:
         label = linkage.cut_count(settings.bodies)
     model, evidence = _settled(reassign(model_of_labels(label, evidence), evidence, 4).compact(), evidence)
-    progress(STAGE, 3, 4)
     return FirstBodies(graph, noise, linkage, model, evidence)
 
 

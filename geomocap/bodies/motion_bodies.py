@@ -12,7 +12,7 @@ from geomocap.bodies.body_evidence import Criterion
 from geomocap.bodies.body_model import BodyModel, Evidence, reassign
 from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.bodies.connected_linkage import Dendrogram
-from geomocap.bodies.first_bodies import STAGE, FirstBodies, first_bodies
+from geomocap.bodies.first_bodies import FirstBodies, first_bodies
 from geomocap.bodies.surface_noise import SurfaceNoise
 from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths, sure_part
@@ -20,6 +20,7 @@ from geomocap.progress import Progress, silent
 from geomocap.trajectories.completion import complete_tracks
 
 _LEAST_SAMPLES = 20
+_STAGE = "bodies"
 _IS_ONE = 0.5  # confidence of a body that explains just what is required
 
 
@@ -138,15 +139,17 @@ def find_motion_bodies(
         raise GeometryError(f"motion paths: {paths.count} samples; at least {_LEAST_SAMPLES} are needed to find bodies")
     # Too many bodies
     positions, certainty = complete_tracks(paths)
-    first = first_bodies(positions, certainty, paths, settings, progress)
+    first = first_bodies(positions, certainty, paths, settings)
+    progress(_STAGE, 1, 3)
     if paths.ray is None and not paths.seen.all():
         sure = certainty[..., None]
         positions = sure * positions + (1.0 - sure) * first.model.carry(first.evidence.rest)
-        first = first_bodies(positions, certainty, paths, settings, progress)
+        first = first_bodies(positions, certainty, paths, settings)
+    progress(_STAGE, 2, 3)
     # Those that are there
     criterion = _criterion(settings, first.noise, rigid=paths.parts is not None)
     model, evidence, curve, confidence = _those_that_are_there(first.model, first.evidence, criterion, settings.bodies)
-    progress(STAGE, 4, 4)
+    progress(_STAGE, 3, 3)
     evidence = replace(evidence, positions=positions)
     return _result(model, evidence, paths, first, curve, confidence)
 
