@@ -49,7 +49,8 @@ def nearest_companions(
     result, costs = np.tile(np.arange(count)[:, None], (1, wanted)), np.full((count, wanted), np.inf)
     if not rows_list:
         return result, costs
-    pairs = np.unique(np.stack([np.concatenate(rows_list), np.concatenate(columns_list)], axis=1), axis=0)
+    keys = np.unique(np.concatenate(rows_list) * count + np.concatenate(columns_list))
+    pairs = np.stack(np.divmod(keys, count), axis=1)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     cost = np.empty(len(pairs))
     spread(_pair_costs, len(pairs), positions, seen, pairs[:, 0].copy(), pairs[:, 1].copy(), cost)
