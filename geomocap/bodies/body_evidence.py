@@ -169,7 +169,10 @@ def _explained(
 
 
 def _spans(some: np.ndarray, main: np.ndarray, partner: np.ndarray, model: BodyModel, evidence: Evidence) -> np.ndarray:
-    """Mean square by which the two bodies of their blends carry samples apart, (n,), metres²; 0 without a second."""
+    """Mean square by which the two bodies of their blends carry samples apart, (n,), metres²; 0 without a second.
+
+    Over the frames in which a sample is seen, as it is by what is missed there that it is compared.
+    """
     result = np.zeros(len(some))
     for a, b in np.unique(np.stack([main, partner], axis=1), axis=0):
         if b < 0:
@@ -177,7 +180,10 @@ def _spans(some: np.ndarray, main: np.ndarray, partner: np.ndarray, model: BodyM
         which = np.flatnonzero((main == a) & (partner == b))
         rest = evidence.rest[some[which]]
         apart = carry(model.rotations[a] - model.rotations[b], model.translations[a] - model.translations[b], rest)
-        result[which] = ((apart - apart.mean(axis=1, keepdims=True)) ** 2).sum(axis=2).mean(axis=1)
+        fraction = evidence.weights[some[which]]
+        fraction = (fraction / np.maximum(fraction.sum(axis=1, keepdims=True), 1e-12))[..., None]
+        middle = (fraction * apart).sum(axis=1, keepdims=True)
+        result[which] = (fraction * (apart - middle) ** 2).sum(axis=(1, 2))
     return result
 
 
