@@ -171,7 +171,7 @@ def _explained(
 def _spans(some: np.ndarray, main: np.ndarray, partner: np.ndarray, model: BodyModel, evidence: Evidence) -> np.ndarray:
     """Mean square by which the two bodies of their blends carry samples apart, (n,), metres²; 0 without a second.
 
-    Over the frames in which a sample is seen, as it is by what is missed there that it is compared.
+    Frames are weighted as they are in what is missed of a sample: those in which it isn't seen don't count.
     """
     result = np.zeros(len(some))
     for a, b in np.unique(np.stack([main, partner], axis=1), axis=0):

@@ -141,7 +141,7 @@ def find_motion_bodies(
     positions, certainty = complete_tracks(paths)
     first = first_bodies(positions, certainty, paths, settings)
     progress(_STAGE, 1, 3)
-    if paths.ray is None and not paths.seen.all():
+    if paths.ray is None and not paths.seen.all():  # where rays leave depths open, rounds of these do as much
         sure = certainty[..., None]
         positions = sure * positions + (1.0 - sure) * first.model.carry(first.evidence.rest)
         first = first_bodies(positions, certainty, paths, settings)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from geomocap.errors import GeometryError
 from geomocap.evaluation.result_check import model_overlap
 from geomocap.model.frame_geometry import Geometry
@@ -17,22 +15,6 @@ from geomocap.skeleton.kinematics import BodyMotion, joint_motion
 from geomocap.subject.model_building import BodyCloud, build_model
 from geomocap.subject.model_following import fit_motion
 from geomocap.subject.subject_model import SubjectModel
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """How well a model explains the silhouettes.
-
-    Attributes
-    ----------
-    overlap : float
-        Of the model, drawn into the cameras, with the silhouettes: intersection over union, mean of the images.
-    fit : BodyMotion, optional
-        The motion that does so, if that is the model fitted to the surfaces and not the one that was found.
-    """
-
-    overlap: float
-    fit: BodyMotion | None = None
 
 
 def make_model(job: Job, geometry: Geometry, motion: Motion) -> SubjectModel | str:
@@ -52,32 +34,26 @@ def make_model(job: Job, geometry: Geometry, motion: Motion) -> SubjectModel | s
     return model
 
 
-def has_unseen(motion: Motion) -> bool:
-    """Whether no path shows some body in some frame."""
-    return not (motion.bodies.reliability > 0).all()
-
-
 def silhouette_overlap(job: Job, model: SubjectModel, motion: Motion) -> float:
-    """Draw a motion's model into the cameras: its overlap with the silhouettes, see `Explanation`."""
+    """Overlap of a motion's model, drawn into the cameras, with the silhouettes: intersection over union, mean."""
     assert job.capture is not None
     return model_overlap(job.run, job.capture, model, motion.skeleton)
 
 
-def explain_silhouettes(
+def fitted_to_surfaces(
     job: Job, geometry: Geometry, model: SubjectModel, motion: Motion, paths: MotionPaths, before: float | None = None
-) -> Explanation:
+) -> BodyMotion | None:
     """Fit a motion's model to the surfaces of all frames if no path shows some body in some frame.
 
     The fit is kept if the model then overlaps the silhouettes more, by at least what the smallest piece of a surface
     is: a surface alone knows less than paths do where these are. `paths` are those that the motion was found from,
-    `before` the overlap without a fit, where it is known.
+    `before` the overlap without a fit, where it is known. None: nothing is to be fitted, or the fit isn't kept.
     """
-    assert job.capture is not None
+    if job.capture is None or (motion.bodies.reliability > 0).all():
+        return None
     found = motion.skeleton
     if before is None:
         before = silhouette_overlap(job, model, motion)
-    if not has_unseen(motion):
-        return Explanation(before)
     start = joint_motion(model.linkage, found.body_rotations, found.root_positions)
     try:
         with job.run.timed("fit") as count:
@@ -86,7 +62,7 @@ def explain_silhouettes(
             )
             count["items"] = len(geometry)
     except GeometryError:  # a frame shows next to nothing of the subject
-        return Explanation(before)
+        return None
     skeleton = model_skeleton(model, followed.bodies, job.fps)
     after = model_overlap(job.run, job.capture, model.reposed(followed.bodies, 0), skeleton)
-    return Explanation(before) if after < before + SMALLEST_PIECE else Explanation(after, followed.bodies)
+    return None if after < before + SMALLEST_PIECE else followed.bodies

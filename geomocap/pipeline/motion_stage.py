@@ -15,7 +15,7 @@ from geomocap.model.frame_geometry import BodyPoints, Geometry
 from geomocap.motion import Motion, MotionSettings, find_motion
 from geomocap.pipeline.following_stage import write_followed
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.motion_models import explain_silhouettes, has_unseen, make_model, silhouette_overlap
+from geomocap.pipeline.motion_models import fitted_to_surfaces, make_model, silhouette_overlap
 from geomocap.pipeline.outline_reading import outlines_of
 from geomocap.pipeline.path_choice import motion_paths
 from geomocap.scheduling import map_items
@@ -84,9 +84,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
         warnings.append(model)
     else:
         write_model(job.run.path / MODEL_FILE, model)
-        fit = None
-        if job.capture is not None and has_unseen(motion):
-            fit = explain_silhouettes(job, geometry, model, motion, choice[source], best.overlap).fit
+        fit = fitted_to_surfaces(job, geometry, model, motion, choice[source], best.overlap)
         if fit is not None:
             write_followed(job, geometry, model, fit)
             axes = posed(model.linkage, fit, 0).axes

@@ -5,6 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from data_tools.figure import figure
 from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.bodies.motion_bodies import find_motion_bodies
 from geomocap.bodies.path_smoothing import smooth_paths
@@ -12,6 +13,7 @@ from geomocap.bodies.point_labels import label_points
 from geomocap.bodies.surface_graph import surface_graph
 from geomocap.bodies.surface_noise import ring_misses, surface_noise
 from geomocap.errors import GeometryError
+from geomocap.files.scan_geometry import ScanSurface, places_on
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.rotations import turn_angles
 from geomocap.motion import unsure_turns
@@ -385,6 +387,19 @@ def test_what_goes_out_of_sight_stays_with_its_body(seed):
     assert same_partition(found.label, body) > 0.99
     by_bodies = np.linalg.norm(found.positions - true, axis=2)[gaps]  # 11 to 14 mm, by neighbours alone 15 to 20
     assert np.quantile(by_bodies, 0.9) < 0.85 * np.quantile(miss, 0.9)
+
+
+def test_soft_limbs_stay_bodies_where_each_path_is_short():
+    """Each point is seen for a quarter of the frames: what is soft is judged over those, as what is missed is."""
+    asset = figure()
+    surfaces = [ScanSurface(asset.vertices(t), asset.faces) for t in np.arange(60) / 30.0]
+    places = places_on(surfaces[0], 1500, seed=0)
+    paths = np.stack([places.of(surface.points) for surface in surfaces], axis=1)
+    rng = np.random.default_rng(0)
+    for path in paths:
+        begin = int(rng.integers(-11, 56))
+        path[: max(begin, 0)] = path[begin + 15 :] = np.nan
+    assert 14 <= find_motion_bodies(MotionPaths(paths)).body_count <= 17  # of 16; over all frames 4 to 6
 
 
 def test_precision_beyond_what_surfaces_give_hardly_counts():
