@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geomocap.bodies.body_evidence import Candidate, Criterion, judge
+from geomocap.bodies.body_evidence import Candidate, Criterion, Turns, judge
 from geomocap.bodies.body_model import BodyModel, Evidence, reassign, refit, settle_rest
 
 _FURTHER = 4  # steps beyond the criterion, as alternatives
@@ -71,10 +71,11 @@ def _weaken(
 ) -> tuple[BodyModel, Evidence]:
     """Take away the weakest body until `count` are left or, without one, all are strong."""
     known: dict[int, Candidate] = {}
+    turns: Turns = {}
     while True:
         bodies = np.unique(model.label).tolist()
-        loose = evidence.with_places_open()
-        known = {b: known[b] if b in known else judge(b, model, loose, criterion) for b in bodies}
+        new = (b for b in bodies if b not in known)
+        known |= judge(new, model, evidence.with_places_open(), criterion, turns)
         weakest = min(known.values(), key=lambda c: (c.strength, c.body))
         if curve and curve[-1].bodies == len(bodies):  # judged anew
             curve.pop()
@@ -86,24 +87,31 @@ def _weaken(
             return model, evidence
         before = model
         model, evidence = remove(weakest, model, evidence)
-        for stale in _changed(before, model, evidence):
-            known.pop(stale, None)
+        stale, turned = _changed(before, model, evidence)
+        known = {b: candidate for b, candidate in known.items() if not stale[b]}
+        turns = {pair: turn for pair, turn in turns.items() if not turned[list(pair)].any()}
 
 
 def confidences(model: BodyModel, evidence: Evidence, criterion: Criterion) -> np.ndarray:
     """How sure it is that each body is one, (B,) float, 0 to 1, see `Candidate`."""
-    loose = evidence.with_places_open()
-    return np.array([judge(b, model, loose, criterion).confidence for b in range(model.count)])
+    judged = judge(range(model.count), model, evidence.with_places_open(), criterion)
+    return np.array([judged[b].confidence for b in range(model.count)])
 
 
-def _changed(before: BodyModel, after: BodyModel, evidence: Evidence) -> list[int]:
-    """Bodies that have other samples or another motion than before, and those that touch them."""
+def _changed(before: BodyModel, after: BodyModel, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+    """Bodies to judge anew, and those of which turns are to be found anew, (B,) bool each.
+
+    The first have other samples or another motion than before, or touch such; of the others turns are known still, but
+    where samples that blended with the one that went follow them alone now.
+    """
     moved = before.label != after.label
     changed = (before.rotations != after.rotations).any(axis=(1, 2, 3))
     changed[before.label[moved]] = True
     changed[after.label[moved]] = True
+    turned = changed.copy()
+    turned[after.label[before.core != after.core]] = True
     touching = (before.contacts(evidence.adjacency) + after.contacts(evidence.adjacency)) > 0
-    return np.flatnonzero(changed | touching[changed].any(axis=0)).tolist()
+    return changed | touching[changed].any(axis=0), turned
 
 
 def remove(candidate: Candidate, model: BodyModel, evidence: Evidence) -> tuple[BodyModel, Evidence]:

@@ -15,6 +15,7 @@ blend of them: a fixed fraction of how far they carry it apart, but no more than
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,13 +96,33 @@ class Candidate:
         return 1.0 if np.isinf(self.strength) else self.strength / (1.0 + self.strength)
 
 
-def judge(body: int, model: BodyModel, evidence: Evidence, criterion: Criterion) -> Candidate:
-    """What speaks for a body.
+Turns = dict[tuple[int, int], float]  # of two bodies, the lower number first, against each other, radians
+
+
+def judge(
+    bodies: Iterable[int], model: BodyModel, evidence: Evidence, criterion: Criterion, turns: Turns | None = None
+) -> dict[int, Candidate]:
+    """What speaks for some bodies, by their number.
 
     A body of too few samples goes, unless others hang together by it alone, as foot and trunk do by a leg that few
     samples are on; its evidence must be greater by as much as it is too small.
+
+    Parameters
+    ----------
+    bodies : iterable of int
+    model : BodyModel
+    evidence : Evidence
+    criterion : Criterion
+    turns : dict, optional
+        Turns that are known already; what is found is added.
     """
-    contacts = model.contacts(evidence.adjacency)
+    contacts, turns = model.contacts(evidence.adjacency), {} if turns is None else turns
+    return {b: _judge(b, model, evidence, criterion, contacts, turns) for b in bodies}
+
+
+def _judge(
+    body: int, model: BodyModel, evidence: Evidence, criterion: Criterion, contacts: np.ndarray, known: Turns
+) -> Candidate:
     neighbours = np.flatnonzero(contacts[body] >= _LEAST_CONTACTS)
     members = np.flatnonzero(model.label == body)
     if not len(neighbours) or not len(members):
@@ -116,7 +137,9 @@ def judge(body: int, model: BodyModel, evidence: Evidence, criterion: Criterion)
     # what noise feigns is no turn
     inertia = max(samples, 1.0) * _square_radius(evidence.rest[members])
     feigned = _FEIGNED * max(criterion.noise.variance, own) / max(inertia, 1e-12)
-    turns = [_turn(body, int(q), model, evidence) for q in neighbours]
+    pairs = [(min(body, q), max(body, q)) for q in neighbours.tolist()]
+    known.update((pair, _turn(*pair, model, evidence)) for pair in pairs if pair not in known)
+    turns = [known[pair] for pair in pairs]
     turn = float(np.sqrt(max(min(turns) ** 2 - feigned, 0.0)))
     by_turn, into = turn / criterion.min_turn, int(neighbours[int(np.argmin(turns))])
     size = float(evidence.counts[members].sum()) / max(criterion.min_fraction * len(model.label), 1e-12)

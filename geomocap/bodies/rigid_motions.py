@@ -13,7 +13,7 @@ from geomocap.scheduling import spread
 _ROUNDS = 5
 _DAMPING = 1e-9
 _STILL = 1e-12 * np.eye(3)  # square metres: a group of one place doesn't turn
-_FEW = 20_000  # positions that are not worth waking other threads for
+FEW_POSITIONS = 20_000  # that are not worth waking other threads for
 _START_ROUNDS = 3  # with all directions alike, before rays are told apart
 
 
@@ -84,7 +84,7 @@ def _step(
     frames = len(rotations)
     middle, normal, right = np.zeros((frames, 3)), np.zeros((frames, 6, 6)), np.zeros((frames, 6))
     arrays = (np.ascontiguousarray(a, np.float64) for a in (rotations, translations, positions, rest, weights, ray))
-    spread(_step_equations, frames, *arrays, middle, normal, right, few=frames if weights.size < _FEW else 1)
+    spread(_step_equations, frames, *arrays, middle, normal, right, few=frames if weights.size < FEW_POSITIONS else 1)
     size = np.einsum("tii->t", normal)[:, None, None]
     step = np.linalg.solve(normal + _DAMPING * size * np.eye(6), right[..., None])[..., 0]
     turn = Rotation.from_rotvec(step[:, :3]).as_matrix()

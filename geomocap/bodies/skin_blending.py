@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
+from geomocap.bodies.rigid_motions import FEW_POSITIONS
 from geomocap.model.motion_paths import DEPTH_FRACTION
 from geomocap.model.small_systems import solve_symmetric
 from geomocap.scheduling import spread
@@ -242,5 +243,6 @@ def explain(
         blends.costs,
         blends.partner,
         blends.fraction,
+        few=len(weights) if weights.size < FEW_POSITIONS else 1,
     )
     return blends
