@@ -13,10 +13,11 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 demo: .stamps/core
 	$(BIN)/geomocap demo $(OUT)
 
-# What compiles most kernels, and what compares numbers of threads, runs by itself with all cores; then the rest runs in
-# two processes of one thread each, every file in one of them.
-ALONE := tests/test_accuracy.py tests/geomocap/test_scheduling.py tests/geomocap/test_patches_tracking.py
-SIDE_BY_SIDE := -n 2 --dist loadfile $(addprefix --ignore=,$(ALONE))
+# What compares numbers of threads runs by itself with all cores; then the rest runs in two processes of one thread each,
+# every file in one of them, those that take longest first.
+ALONE := tests/geomocap/test_scheduling.py tests/geomocap/test_patches_tracking.py
+SIDE_BY_SIDE := -n 2 --dist loadfile --no-loadscope-reorder $(addprefix --ignore=,$(ALONE)) \
+	tests/test_accuracy.py tests/cli tests/viz tests
 
 test: lint
 	$(BIN)/python -m pytest $(ALONE)

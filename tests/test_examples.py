@@ -38,7 +38,8 @@ def test_every_example_is_tested_and_short():
 def test_a_capture_to_a_skeleton(tmp_path, monkeypatch, capsys):
     settings = SynthesisSettings(cameras=4, width=160, height=120, fps=10, frames=6)
     synthesize(figure(), tmp_path / "capture", tmp_path / "truth", settings)
-    (tmp_path / "settings.toml").write_text("[carving]\nresolution = 64\n")
+    settings_file = "[carving]\nresolution = 64\n[nodes]\nnodes = 240\n[tracking]\nn_patches = 400\n"
+    (tmp_path / "settings.toml").write_text(settings_file)
     run_example(
         "capture_to_skeleton",
         monkeypatch,

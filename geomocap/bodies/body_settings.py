@@ -6,6 +6,8 @@ from pydantic import Field
 
 from geomocap.settings import Settings
 
+FOLLOWED = 2e-4  # diagonals; no surface is followed more exactly, whatever is stated
+
 
 class MotionBodiesSettings(Settings):
     """How rigid bodies are found from motion paths."""

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from geomocap.bodies.body_model import BodyModel, Evidence, model_of_labels, reassign, refit, settle_rest
-from geomocap.bodies.body_settings import MotionBodiesSettings
+from geomocap.bodies.body_settings import FOLLOWED, MotionBodiesSettings
 from geomocap.bodies.connected_linkage import Dendrogram, connected_linkage
 from geomocap.bodies.local_rotations import local_rotations, turn_distances
 from geomocap.bodies.path_smoothing import smooth_paths
@@ -140,7 +140,7 @@ def _evidence(
         near,
         settings.blend_penalty * diagonal if settings.blends else np.inf,
         settings.largest_residual * diagonal,
-        2e-4 * diagonal,
+        FOLLOWED * diagonal,
         settings.smoothness,
     )
 

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
-from geomocap.bodies.body_settings import MotionBodiesSettings
+from geomocap.bodies.body_settings import FOLLOWED, MotionBodiesSettings
 from geomocap.bodies.motion_bodies import MotionBodies, find_motion_bodies
 from geomocap.bodies.rigid_motions import fit_rigid_motion
 from geomocap.bodies.shape_across_time import MAY_MISS, hull_fronts
@@ -36,7 +36,6 @@ _LOCAL = 0.06  # diagonals between a sample and the nearest one of a body that m
 _BEFORE = 0.01  # diagonals by which it may come before the hull
 _CORE = 0.85  # fraction of one body that makes a sample tell its motion
 _LEAST = 6  # samples of a body
-_NOISE = 2e-4  # diagonals
 _REGULAR = 1e-9
 _REACH = 0.15  # diagonals; fronts are looked for so far: hulls of four cameras stood off a trunk by 0.1 (90 %)
 _STEP = 0.004  # diagonals; in steps, thinner than what any body is wide
@@ -200,7 +199,7 @@ def _refit(
         there = np.where(seen[some, :, None], positions[some], carried)
         sure = np.where(seen[some], 1.0, 1e-3)
         rotations[b], translations[b], _ = fit_rigid_motion(
-            there, places.rest[some], sure, _NOISE * paths.diagonal, ray=paths.ray[some]
+            there, places.rest[some], sure, FOLLOWED * paths.diagonal, ray=paths.ray[some]
         )
     weights = weights[:, kept]
     weights /= weights.sum(axis=1, keepdims=True)

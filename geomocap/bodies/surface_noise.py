@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
+from geomocap.bodies.body_settings import FOLLOWED
 from geomocap.bodies.rigid_motions import fit_rigid_motion
 from geomocap.bodies.surface_graph import SurfaceGraph
 from geomocap.model.even_choice import evenly_chosen
@@ -23,7 +24,6 @@ from geomocap.scheduling import spread
 _RING = (0.03, 0.06)  # diagonals; a disc of the inner radius is about a hundredth of the surface of a person
 _SPACINGS = 5.0  # the ring's outer radius is at least so many times the distance of neighbours
 _QUANTILE = 0.25
-_GIVE = 2e-4  # diagonals; no surface is followed more exactly
 _FRAMES = 40
 _LEAST = 4  # samples in a ring
 _ASKED = 300  # samples whose rings are asked, where rays make that slow
@@ -99,7 +99,7 @@ def surface_noise(
             misses[i] = _miss_across(i, np.flatnonzero(ring[i]), positions, weights, reference, ray)
         misses = sure_part(misses, ray)
     step = _BIN * graph.spacing
-    give = 3.0 * (_GIVE * diagonal) ** 2
+    give = 3.0 * (FOLLOWED * diagonal) ** 2
     if not known.any():
         return SurfaceNoise(give, np.zeros(_BINS), step)
     misses, weights = misses[known], weights[known]

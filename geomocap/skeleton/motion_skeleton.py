@@ -8,6 +8,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from geomocap.bodies.body_settings import FOLLOWED
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.errors import GeometryError
 from geomocap.model.skeleton import Skeleton, bone_fixed_skeleton
@@ -16,7 +17,7 @@ from geomocap.skeleton.body_observations import Observations, SkinPoints
 from geomocap.skeleton.borders import Border, contacts, find_borders
 from geomocap.skeleton.common_points import CommonPoint, common_point
 from geomocap.skeleton.kinematics import BodyMotion, Linkage, joint_motion
-from geomocap.skeleton.motion_skeleton_settings import FOLLOWED, MotionSkeletonSettings
+from geomocap.skeleton.motion_skeleton_settings import MotionSkeletonSettings
 from geomocap.skeleton.spanning_tree import Connection, connect_by_cost, connection_cost
 
 

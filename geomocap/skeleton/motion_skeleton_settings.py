@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from geomocap.bodies.body_settings import FOLLOWED
 from geomocap.settings import Settings
-
-FOLLOWED = 2e-4  # diagonals; no surface is followed more exactly, whatever is stated
 
 
 class MotionSkeletonSettings(Settings):

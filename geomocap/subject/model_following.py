@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from geomocap.bodies.body_settings import FOLLOWED
 from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.rotations import turn_angles
@@ -18,7 +19,6 @@ from geomocap.progress import Progress, silent
 from geomocap.skeleton.articulated_adjustment import adjust
 from geomocap.skeleton.body_observations import Observations, SkinPoints
 from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, body_motion
-from geomocap.skeleton.motion_skeleton_settings import FOLLOWED
 from geomocap.skeleton.motion_smoothness import PosePrior, Smoothness, typical_accelerations
 from geomocap.subject.following_settings import FollowingSettings
 from geomocap.subject.pose_search import find_pose, fit_pose

@@ -13,6 +13,7 @@ from tests.conftest import Finished
 
 FRAMES, CAMERAS = 6, 4
 SETTINGS = ["--carving.resolution", "64"]
+QUICK = [*SETTINGS, "--nodes.nodes", "240", "--tracking.n_patches", "400"]  # of whole runs
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from tests.cli.conftest import SETTINGS
+from tests.cli.conftest import QUICK, SETTINGS
 from tests.cli.test_run import digests
 
 pytest.importorskip("distributed")
@@ -34,7 +34,7 @@ def scheduler():
 @pytest.mark.slow
 def test_cluster_gives_the_same_files(small_capture, geomocap, scheduler, tmp_path):
     geomocap("voxels", small_capture, tmp_path / "threads", *SETTINGS)
-    arguments = ["run", small_capture, tmp_path / "dask", *SETTINGS, "--no-pictures", "--scheduler", scheduler]
+    arguments = ["run", small_capture, tmp_path / "dask", *QUICK, "--no-pictures", "--scheduler", scheduler]
     result = subprocess.run([sys.executable, "-m", "geomocap", *arguments], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     made = digests(tmp_path / "dask")

@@ -17,7 +17,7 @@ import pytest
 
 from data_tools.calibration_files import read_calibration
 from geomocap.files.frame_files import read_points, read_voxels
-from tests.cli.conftest import CAMERAS, FRAMES, SETTINGS
+from tests.cli.conftest import CAMERAS, FRAMES, QUICK, SETTINGS
 
 CHANGING = {"timings.json", "run.toml"}
 
@@ -34,7 +34,7 @@ def digests(run: Path) -> dict[str, str]:
 @pytest.fixture(scope="session")
 def finished(small_capture, geomocap, tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("runs") / "run"
-    geomocap("run", small_capture, run, *SETTINGS, "--no-pictures")
+    geomocap("run", small_capture, run, *QUICK, "--no-pictures")
     return run
 
 
@@ -70,21 +70,21 @@ def test_results_repeat_bit_for_bit_with_any_number_of_workers(finished, small_c
 
 def test_nothing_is_done_twice(finished, small_capture, geomocap):
     before = {p: p.stat().st_mtime_ns for p in finished.rglob("*.ply")}
-    geomocap("run", small_capture, finished, *SETTINGS, "--no-pictures")
+    geomocap("run", small_capture, finished, *QUICK, "--no-pictures")
     assert {p: p.stat().st_mtime_ns for p in finished.rglob("*.ply")} == before
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stop_after", ["silhouettes/*/*.png", "voxels/*.ply", "bodies/*.ply"])
-def test_killed_run_goes_on_and_ends_with_the_same_files(finished, small_capture, geomocap, tmp_path, stop_after):
+def test_a_run_killed_again_and_again_goes_on_and_ends_with_the_same_files(finished, small_capture, geomocap, tmp_path):
     run = tmp_path / "run"
-    command = [sys.executable, "-m", "geomocap", "run", str(small_capture), str(run), *SETTINGS, "--no-pictures"]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-    while process.poll() is None and len(list(run.glob(stop_after))) < 2:
-        time.sleep(0.005)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    geomocap("run", small_capture, run, *SETTINGS, "--no-pictures")
+    command = [sys.executable, "-m", "geomocap", "run", str(small_capture), str(run), *QUICK, "--no-pictures"]
+    for stop_after in ("silhouettes/*/*.png", "voxels/*.ply", "bodies/*.ply"):
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        while process.poll() is None and len(list(run.glob(stop_after))) < 2:
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+    geomocap("run", small_capture, run, *QUICK, "--no-pictures")
     assert digests(run) == digests(finished)
 
 
@@ -119,7 +119,7 @@ def test_given_masks_are_used_as_they_are(capture, small_capture, geomocap, tmp_
 
 def test_scans_are_segmented_like_voxels(finished, small_capture, geomocap, tmp_path):
     m3 = ["--segmentation.method", "m3", "--no-pictures"]
-    geomocap("run", small_capture, tmp_path / "voxels", *SETTINGS, *m3)
+    geomocap("run", small_capture, tmp_path / "voxels", *QUICK, *m3)
     geomocap("segment", finished / "voxels", tmp_path / "scans", "--fps", 10, *m3)
     ours, other = np.load(tmp_path / "scans/ellipsoids.npz"), np.load(tmp_path / "voxels/ellipsoids.npz")
     np.testing.assert_allclose(ours["centers"], other["centers"], atol=1e-9)
