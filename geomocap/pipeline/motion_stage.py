@@ -15,16 +15,12 @@ from geomocap.model.frame_geometry import BodyPoints, Geometry
 from geomocap.motion import Motion, MotionSettings, find_motion
 from geomocap.pipeline.following_stage import write_followed
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.motion_models import fitted_to_surfaces, make_model, silhouette_overlap
+from geomocap.pipeline.motion_models import fitted_to_surfaces, make_model, misfit, silhouette_overlap
 from geomocap.pipeline.outline_reading import outlines_of
 from geomocap.pipeline.path_choice import motion_paths
 from geomocap.scheduling import map_items
 from geomocap.skeleton.kinematics import posed
 from geomocap.subject.subject_model import MODEL_FILE, SubjectModel, write_model
-
-# Of the overlap of a model and the silhouettes. In nine hard captures bodies that were there raised it by 0.0045 to
-# 0.035 each, those that were not by 0.002 at most.
-_BODY_PRICE = 0.003
 
 
 @dataclass(frozen=True)
@@ -45,15 +41,15 @@ class _Candidate:
     overlap: float | None
 
     @property
-    def worth(self) -> float:
-        """Overlap with the silhouettes less the price of the bodies."""
-        return (self.overlap or 0.0) - _BODY_PRICE * self.motion.body_count
+    def misfit(self) -> float:
+        """See `motion_models.misfit`; infinite without a model."""
+        return np.inf if self.overlap is None else misfit(self.motion, self.overlap)
 
 
 def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     """Find bodies and skeleton from motion paths, write them, and return the number of frames.
 
-    Where there are several kinds of paths, what explains the silhouettes best is taken. `has_tracks` is what
+    Where there are several kinds of paths, what explains silhouettes and paths best is taken. `has_tracks` is what
     `motion_paths` takes.
     """
     frames, config = len(geometry), job.config
@@ -69,7 +65,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
         }
         count["items"] = frames
     candidates = {source: _candidate(job, geometry, motion, len(choice) > 1) for source, motion in found_from.items()}
-    source = max(candidates, key=lambda which: candidates[which].worth)
+    source = min(candidates, key=lambda which: candidates[which].misfit)
     best = candidates[source]
     motion, model = best.motion, best.model
     bodies, found = motion.bodies, motion.connected

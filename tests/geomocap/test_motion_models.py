@@ -104,3 +104,15 @@ def test_a_frame_with_next_to_nothing_leaves_the_motion_as_it_was(case, monkeypa
     overlaps(monkeypatch, 0.70, 0.75)
     case.geometry.places[3] = np.zeros((2, 3))
     assert case.fit() is None
+
+
+def test_silhouettes_and_paths_both_speak_against_a_motion():
+    def of(overlap: float, residuals: list[float]) -> float:
+        return motion_models.misfit(SimpleNamespace(bodies=SimpleNamespace(residuals=np.array(residuals))), overlap)
+
+    assert of(0.95, [0.01, 0.02]) < of(0.90, [0.01, 0.02])
+    assert of(0.90, [0.01, 0.01]) < of(0.90, [0.01, 0.03])
+    assert of(0.938, [0.009]) < of(0.943, [0.016])  # a horse's trunk, by patches and by nodes that slide
+    assert of(0.937, [0.016]) < of(0.908, [0.011])  # plain legs that patches lose
+    smaller = of(0.9, [1e-5]) / of(0.95, [3e-5])  # the same in other units
+    assert smaller == pytest.approx(of(0.9, [0.01]) / of(0.95, [0.03]))
