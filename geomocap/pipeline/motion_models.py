@@ -17,8 +17,8 @@ from geomocap.subject.model_following import fit_motion
 from geomocap.subject.subject_model import SubjectModel
 
 # Power of what the paths miss, beside what the model's drawn surface misses of the silhouettes. Of the two results for
-# each of eleven captures the better was taken with any power from 0.15 to 0.9 in nine, with 0 in six; in one of the
-# other two neither was better.
+# each of thirteen captures the better was taken with any power from 0.15 to 0.9 in eleven, with 0 in eight; in one of
+# the other two neither was better. Two of the captures were looked at after the number was set.
 _PATHS = 0.5
 
 
