@@ -1,4 +1,4 @@
-"""Models of motions that were found, and how well they explain the silhouettes."""
+"""Models of motions that were found, and how well these explain the silhouettes and the paths they come from."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from data_tools.figure import figure
+from geomocap.bodies import body_elimination
 from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.bodies.motion_bodies import find_motion_bodies
 from geomocap.bodies.path_smoothing import smooth_paths
@@ -13,7 +13,6 @@ from geomocap.bodies.point_labels import label_points
 from geomocap.bodies.surface_graph import surface_graph
 from geomocap.bodies.surface_noise import ring_misses, surface_noise
 from geomocap.errors import GeometryError
-from geomocap.files.scan_geometry import ScanSurface, places_on
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.rotations import turn_angles
 from geomocap.motion import unsure_turns
@@ -22,8 +21,7 @@ from geomocap.skeleton.borders import Border
 from geomocap.skeleton.common_points import common_point
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
 from geomocap.skeleton.refinement import refine_skeleton
-from geomocap.trajectories.completion import complete_tracks
-from tests.geomocap.moving_chains import chain, same_partition, seen_by_single_cameras, seen_while_it_turns
+from tests.geomocap.moving_chains import chain, same_partition, seen_by_single_cameras
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +55,24 @@ def test_result_is_the_same_bit_for_bit(three, found):
     again = find_motion_bodies(MotionPaths(three.positions))
     np.testing.assert_array_equal(again.label, found.label)
     np.testing.assert_array_equal(again.rotations, found.rotations)
+
+
+def test_turns_that_are_known_still_are_those_found_anew(three, monkeypatch):
+    rng = np.random.default_rng(1)
+    paths = MotionPaths(three.positions + rng.normal(scale=0.004, size=three.positions.shape))
+    before, asked = find_motion_bodies(paths), []
+
+    def all_turned(*models):
+        stale, turned = changed(*models)
+        asked.append(turned.mean())
+        return stale, np.ones_like(turned)
+
+    changed = body_elimination._changed
+    monkeypatch.setattr(body_elimination, "_changed", all_turned)
+    again = find_motion_bodies(paths)
+    assert asked and min(asked) < 0.8  # there are turns to keep
+    np.testing.assert_array_equal(again.rotations, before.rotations)
+    assert [(step.strength, step.turn_deg) for step in again.curve] == [(s.strength, s.turn_deg) for s in before.curve]
 
 
 def test_bodies_are_joined_of_known_parts(three):
@@ -240,20 +256,6 @@ def test_bodies_that_single_cameras_see_turn_as_what_they_see_across_says(three)
     assert errors[1] < 0.4 * errors[0]
 
 
-def test_broken_paths_give_the_same_bodies(three):
-    rng = np.random.default_rng(1)
-    start = rng.integers(-6, 16, len(three.body))
-    frame = np.arange(24)
-    alive = (frame >= start[:, None]) & (frame < start[:, None] + 12)
-    positions = np.where(alive[..., None], three.positions, np.nan)
-    bodies = find_motion_bodies(MotionPaths(positions))
-    assert bodies.body_count == 3
-    assert same_partition(bodies.label, three.body) > 0.93
-    gap = ~alive
-    miss = np.linalg.norm(bodies.positions - three.positions, axis=2)[gap]
-    assert np.median(miss) < 0.02
-
-
 def test_joints_hinges_and_tree_of_a_chain(three, found):
     result, _ = refine_skeleton(find_motion_skeleton(found, 30.0), found, MotionPaths(three.positions))
     skeleton = result.skeleton
@@ -362,44 +364,6 @@ def test_joint_of_motions_that_do_not_tell_stays_at_the_interface():
         return float(np.linalg.norm(joint.point - near))
 
     assert away(1e3) > 0.5 and away(0.05) < 0.05
-
-
-def test_completion_carries_gaps_with_the_neighbours(three):
-    positions = three.positions.copy()
-    positions[::5, 6:18] = np.nan
-    filled, certainty = complete_tracks(MotionPaths(positions))
-    miss = np.linalg.norm(filled - three.positions, axis=2)
-    assert np.median(miss[::5, 6:18]) < 0.01
-    assert (certainty[::5, 6:18] < 1).all() and (certainty[::5, 6:18] > 0).all()
-    np.testing.assert_array_equal(filled[1::5], three.positions[1::5])
-
-
-@pytest.mark.parametrize("seed", [0, 1, 3])
-def test_what_goes_out_of_sight_stays_with_its_body(seed):
-    seen, true, body = seen_while_it_turns(seed)
-    gaps = np.isnan(seen[..., 0])
-    assert gaps.mean() > 0.4
-    filled, _ = complete_tracks(MotionPaths(seen))
-    miss = np.linalg.norm(filled - true, axis=2)[gaps]
-    assert np.median(miss) < 0.01 and np.quantile(miss, 0.9) < 0.05  # of boxes 0.4 m long
-    found = find_motion_bodies(MotionPaths(seen))
-    assert found.body_count == 3
-    assert same_partition(found.label, body) > 0.99
-    by_bodies = np.linalg.norm(found.positions - true, axis=2)[gaps]  # 11 to 14 mm, by neighbours alone 15 to 20
-    assert np.quantile(by_bodies, 0.9) < 0.85 * np.quantile(miss, 0.9)
-
-
-def test_soft_limbs_stay_bodies_where_each_path_is_short():
-    """Each point is seen for a quarter of the frames: what is soft is judged over those, as what is missed is."""
-    asset = figure()
-    surfaces = [ScanSurface(asset.vertices(t), asset.faces) for t in np.arange(60) / 30.0]
-    places = places_on(surfaces[0], 1500, seed=0)
-    paths = np.stack([places.of(surface.points) for surface in surfaces], axis=1)
-    rng = np.random.default_rng(0)
-    for path in paths:
-        begin = int(rng.integers(-11, 56))
-        path[: max(begin, 0)] = path[begin + 15 :] = np.nan
-    assert 14 <= find_motion_bodies(MotionPaths(paths)).body_count <= 17  # of 16; over all frames 4 to 6
 
 
 def test_precision_beyond_what_surfaces_give_hardly_counts():
