@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -47,7 +48,7 @@ class NodeGraph:
     binding: np.ndarray
     weights: np.ndarray
 
-    @property
+    @cached_property
     def offsets(self) -> np.ndarray:
         """Samples relative to their nodes in the reference frame, (S, K, 3), metres."""
         return self.samples[:, None] - self.nodes[self.binding]

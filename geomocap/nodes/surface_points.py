@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
@@ -61,15 +62,20 @@ class PointSet:
         """
         distance, nearest = cKDTree(surface).query(self.positions)
         own = np.exp(-0.5 * (distance / scale) ** 2) * (self.normals * normals[nearest]).sum(axis=1)
-        i, j = _pairs(self.positions, min(8, len(self) - 1))
-        cosine = (self.normals[i] * self.normals[j]).sum(axis=1)
-        parallel = csr_matrix((np.where(np.abs(cosine) > 0.6, cosine, 0.0), (i, j)), (len(self), len(self)))
-        parallel = parallel + parallel.T
-        total = np.maximum(np.asarray(np.abs(parallel).sum(axis=1)).ravel(), 1e-9)
+        parallel, total = self._beside
         vote = own
         for _ in range(_ROUNDS):
             vote = own + 0.95 * (parallel @ vote) / total
         return replace(self, normals=np.where((vote < 0)[:, None], -self.normals, self.normals))
+
+    @cached_property
+    def _beside(self) -> tuple[csr_matrix, np.ndarray]:
+        """Cosines between the normals of neighbouring points, where these are parallel, (M, M); their sums, (M,)."""
+        i, j = _pairs(self.positions, min(8, len(self) - 1))
+        cosine = (self.normals[i] * self.normals[j]).sum(axis=1)
+        parallel = csr_matrix((np.where(np.abs(cosine) > 0.6, cosine, 0.0), (i, j)), (len(self), len(self)))
+        parallel = parallel + parallel.T
+        return parallel, np.maximum(np.asarray(np.abs(parallel).sum(axis=1)).ravel(), 1e-9)
 
     def thinned(self, count: int, seed: int) -> PointSet:
         """Return at most `count` points, drawn at random."""

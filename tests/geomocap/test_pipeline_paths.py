@@ -88,12 +88,15 @@ def test_nodes_on_the_piece_that_patches_leave_uncovered(job):
     assert np.nanmedian(paths.sigma[300:]) > 5 * np.nanmedian(paths.sigma[:300])
 
 
-def test_where_single_cameras_follow_the_surface_there_are_nodes_to_choose_instead(job):
-    tracks = trajectories(300, 1.0, 0.0)
+@pytest.mark.parametrize(("lowest", "kinds"), [(0.5, ["patches", "both"]), (-0.5, ["patches"])])
+def test_where_single_cameras_follow_less_than_half_of_the_surface_there_are_nodes_to_choose_instead(
+    job, lowest, kinds
+):
+    tracks = trajectories(300, 1.0, lowest)
     ray = np.zeros_like(tracks)
     ray[::2, :, 1] = 1.0
     found = motion_paths(job("auto", tracks, ray), Ball(), True)
-    assert list(found) == ["patches", "both"]
+    assert list(found) == kinds
     assert found["patches"].ray is not None
 
 
