@@ -1,4 +1,4 @@
-"""The heaviest choices searched with Python's whole numbers as sets: slow and obvious, what the kernel must agree with."""
+"""The heaviest choices searched with whole numbers as sets: slow and obvious, what the kernel must agree with."""
 
 from __future__ import annotations
 
