@@ -119,10 +119,10 @@ def motion_video(
         view = stage.view(azimuth, 12.0, size)
         skin = scene.body_skin(results, frame, 90)
         bones = scene.skeleton(results, frame, stage.diagonal)
-        panels = []
+        panels, solid = [], Model([skin])
         if show_bodies:
-            panels.append(on_paper(picture(results, stage, Model([skin]), view, frame, look)))
-        model = Model([scene.glass(skin), *bones] if bones else [skin])
+            panels.append(on_paper(picture(results, stage, solid, view, frame, look)))
+        model = Model([scene.glass(skin), *bones], like=solid) if bones else solid
         if bones:
             panels.append(on_paper(picture(results, stage, model, view, frame, look)))
         if camera is not None:

@@ -80,6 +80,7 @@ class Layer:
 class _Surfaces:
     """Meshes as one ray casting scene with flat attribute arrays."""
 
+    meshes: tuple[Mesh, ...]
     scene: TriangleScene
     faces: np.ndarray
     normals: np.ndarray
@@ -89,13 +90,16 @@ class _Surfaces:
     label: np.ndarray  # of mesh and colour; 0 where no outline is wanted
 
 
-def _surfaces(meshes: Sequence[Mesh]) -> _Surfaces | None:
+def _surfaces(meshes: Sequence[Mesh], like: Sequence[_Surfaces | None] = ()) -> _Surfaces | None:
+    """Sort meshes for rays, unless one of `like` has the same triangles in other colours."""
     if not meshes:
         return None
     vertices, faces = _triangles(meshes)
     sizes = [len(m.faces) for m in meshes]
+    sorted_before = (other.scene for other in like if other is not None and _same_triangles(meshes, other.meshes))
     return _Surfaces(
-        TriangleScene(vertices, faces),
+        tuple(meshes),
+        next(sorted_before, None) or TriangleScene(vertices, faces),
         faces,
         np.concatenate([m.normals for m in meshes]).astype(np.float32),
         np.concatenate([m.colors for m in meshes]).astype(np.float32),
@@ -103,6 +107,12 @@ def _surfaces(meshes: Sequence[Mesh]) -> _Surfaces | None:
         np.repeat([m.rim for m in meshes], sizes).astype(np.float32),
         np.concatenate([_labels(k, m) for k, m in enumerate(meshes)]),
     )
+
+
+def _same_triangles(some: Sequence[Mesh], others: Sequence[Mesh]) -> bool:
+    """Whether meshes are made of the very same arrays, as those are that were recoloured."""
+    same = (a.vertices is b.vertices and a.faces is b.faces for a, b in zip(some, others, strict=False))
+    return len(some) == len(others) and all(same)
 
 
 def _triangles(meshes: Sequence[Mesh]) -> tuple[np.ndarray, np.ndarray]:
@@ -120,13 +130,16 @@ class Model:
     ----------
     meshes : sequence of Mesh
         In any order; those without triangles are left out.
+    like : Model, optional
+        A model with some of these meshes in other colours: they aren't sorted for rays again.
     """
 
-    def __init__(self, meshes: Sequence[Mesh]) -> None:
+    def __init__(self, meshes: Sequence[Mesh], like: Model | None = None) -> None:
+        known: Sequence[_Surfaces | None] = () if like is None else (like._opaque, like._clear)
         self.meshes = [m for m in meshes if len(m.faces)]
         self._triangles = _triangles(self.meshes)
-        self._opaque = _surfaces([m for m in self.meshes if m.alpha >= 1])
-        self._clear = _surfaces([m for m in self.meshes if m.alpha < 1])
+        self._opaque: _Surfaces | None = _surfaces([m for m in self.meshes if m.alpha >= 1], known)
+        self._clear: _Surfaces | None = _surfaces([m for m in self.meshes if m.alpha < 1], known)
 
     def render(self, view: View, look: Look | None = None, up: np.ndarray | None = None) -> Layer:
         """Render the meshes as a view sees them.

@@ -22,12 +22,13 @@ _CORNERS = np.array(
 )
 
 
-def spacing(points: np.ndarray) -> float:
-    """Return the median distance of points (N, 3) to their nearest neighbours, metres."""
+def spacing(points: np.ndarray, tree: cKDTree | None = None) -> float:
+    """Return the median distance of points (N, 3), those of the tree if one is given, to their nearest neighbours."""
     if len(points) < 2:
         return 0.01
+    tree = tree or cKDTree(points, balanced_tree=False, compact_nodes=False)
     sample = points[:: max(1, len(points) // 1000)]
-    return max(float(np.median(cKDTree(points).query(sample, k=2)[0][:, 1])), 1e-6)
+    return max(float(np.median(tree.query(sample, k=2)[0][:, 1])), 1e-6)
 
 
 def cubes(indices: np.ndarray, origin: np.ndarray, size: float, colors: np.ndarray) -> Mesh:
@@ -98,7 +99,8 @@ def skin(points: np.ndarray, colors: np.ndarray, cells: int = 120, smoothing: fl
     if len(points) == 0:
         return EMPTY
     low, high = points.min(axis=0), points.max(axis=0)
-    cell = max(float((high - low).max()) / cells, 1.15 * spacing(points), 1e-6)
+    tree = cKDTree(points)
+    cell = max(float((high - low).max()) / cells, 1.15 * spacing(points, tree), 1e-6)
     pad = 4
     index = np.floor((points - low) / cell).astype(int) + pad
     occupied = np.zeros(index.max(axis=0) + pad + 1, bool)
@@ -110,7 +112,7 @@ def skin(points: np.ndarray, colors: np.ndarray, cells: int = 120, smoothing: fl
     vertices, faces = surface_nets(field, 0.25)
     vertices = low + (vertices - pad + 0.5) * cell
     centers = vertices[faces].mean(axis=1)
-    nearest = cKDTree(points).query(centers)[1]
+    nearest = tree.query(centers)[1]
     return Mesh(vertices, faces, vertex_normals(vertices, faces), colors[nearest] / 255.0)
 
 

@@ -39,10 +39,8 @@ def voxel_colors(views: PinholeViews, images: np.ndarray, grid: Grid, occupancy:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _blend(seen, samples, positions, normal, centers, colors, has_color):
     N, C = seen.shape
+    weights, values, order = np.empty(C, np.float64), np.empty(C, np.float64), np.empty(C, np.int64)
     for n in range(N):
-        weights = np.empty(C, np.float64)
-        values = np.empty(C, np.float64)
-        order = np.empty(C, np.int64)
         total = 0.0
         for c in range(C):
             if seen[n, c]:

@@ -94,8 +94,8 @@ def color_deviation(seen: VoxelVisibility, gains: np.ndarray, min_cameras: int) 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _deviate(seen, colors, low, high, gains, min_cameras, out):
     N, C = seen.shape
+    values = np.empty(C, np.float32)
     for n in range(N):
-        values = np.empty(C, np.float32)
         count = 0
         total = np.float32(0)
         for a in range(3):

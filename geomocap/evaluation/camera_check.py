@@ -158,7 +158,10 @@ class _Look:
         capture = self.capture
         if capture.has_masks:
             return CameraLook(None, tuple(self.silhouette(camera, k, None) for k in self.frames))
-        images = [self.small(camera, k) for k in self.frames]
+        source, chosen = capture.sources[camera], self._background_frames(camera)
+        shown = [capture.first + k for k in self.frames]
+        known = {n: self._shrink(camera, source.read(n)) for n in sorted({*shown, *chosen})}  # a video is decoded once
+        images = [known[n] for n in shown]
         if max(int(np.ptp(image)) for image in images) <= FLAT:
             return CameraLook(None, None, (f"camera {camera}: its pictures show nothing but one colour",), True)
         warnings = []
@@ -175,11 +178,7 @@ class _Look:
                 warnings.append(f"background/{camera}.png: is missing; the background is estimated from the frames")
             if capture.n_recorded < BACKGROUND_FRAMES:
                 return CameraLook(None, None, tuple(warnings))
-            source = capture.sources[camera]
-            chosen = evenly_chosen(len(source), min(self.settings.samples, SAMPLES))
-            model = model_from_frames(
-                [self._shrink(camera, source.read(int(k))) for k in chosen], self.settings, camera
-            )
+            model = model_from_frames([known[n] for n in chosen], self.settings, camera)
         scene = SilhouetteScene.unlearnt([model], None, self.settings)
         scene = scene.learnt([scene.count([image]) for image in images])
         masks = tuple(scene.alone([image])[0] for image in images)
@@ -191,6 +190,13 @@ class _Look:
             )
         median = np.median(images, axis=0).astype(np.uint8)
         return CameraLook(scene, masks, tuple(warnings), False, None if plate is None else plate[..., :3], median)
+
+    def _background_frames(self, camera: str) -> list[int]:
+        """Frames, numbered as recorded, that tell the background of a camera; none where that is known or can't be."""
+        capture = self.capture
+        if capture.has_background(camera) or capture.n_recorded < BACKGROUND_FRAMES:
+            return []
+        return evenly_chosen(len(capture.sources[camera]), min(self.settings.samples, SAMPLES)).tolist()
 
     def silhouette(self, camera: str, frame: int, scene: SilhouetteScene | None) -> np.ndarray:
         """Silhouette of a frame in a small image, (H, W) uint8."""

@@ -10,11 +10,12 @@ import open3d as o3d
 
 from geomocap.errors import GeometryError
 from geomocap.files.array_schema import quiet_nan
-from geomocap.files.atomic import write_atomic
+from geomocap.files.atomic import write_atomic, write_bytes
 from geomocap.files.geometry_claims import check_geometry
 from geomocap.files.open3d_geometry import check_ply, read_by_open3d, write_by_open3d
 from geomocap.files.whole_files import is_whole_ply
 from geomocap.model.frame_geometry import BodyPoints, Voxels
+from geomocap.model.palette import body_colors
 from geomocap.reading import open_plain, read_bytes
 
 
@@ -52,9 +53,35 @@ def read_voxels(path: Path) -> Voxels:
 
 def write_points(path: Path, points: BodyPoints | o3d.t.geometry.PointCloud) -> None:
     """Write points with their bodies, or any tensor point cloud, as PLY, whole or not at all."""
+    if isinstance(points, BodyPoints) and len(points.positions):
+        write_bytes(path, _body_file(points), lasting=False)
+        return
     cloud = points.to_open3d() if isinstance(points, BodyPoints) else points
     size = sum(tensor.numpy().nbytes for _, tensor in cloud.point.items())
     write_atomic(path, write_by_open3d(o3d.t.io.write_point_cloud, cloud, size), is_whole_ply, lasting=False)
+
+
+_BODY_HEADER = """ply
+format binary_little_endian 1.0
+comment Created by Open3D
+element vertex {}
+property float x
+property float y
+property float z
+property uchar red
+property uchar green
+property uchar blue
+property int body
+end_header
+"""
+_BODY_POINT = np.dtype([("position", "<f4", 3), ("color", "u1", 3), ("body", "<i4")])
+
+
+def _body_file(points: BodyPoints) -> bytes:
+    """Return what Open3D writes of `points.to_open3d()`, which takes it ten times as long."""
+    rows = np.empty(len(points.positions), _BODY_POINT)
+    rows["position"], rows["color"], rows["body"] = points.positions, body_colors(points.body), points.body
+    return _BODY_HEADER.format(len(rows)).encode() + rows.tobytes()
 
 
 def read_points(path: Path) -> BodyPoints:

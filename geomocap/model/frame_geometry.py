@@ -107,8 +107,20 @@ class Voxels:
     @classmethod
     def sorted(cls, indices: np.ndarray, colors: np.ndarray, origin: np.ndarray, voxel_size: float) -> Voxels:
         """Return voxels sorted by x, y, z index."""
-        order = np.lexsort(indices.T[::-1])
+        order = _order(indices)
         return cls(indices[order], colors[order], origin, voxel_size)
+
+
+def _order(indices: np.ndarray) -> np.ndarray:
+    """Order (N,) of grid indices (N, 3) by x, y, z; those that are there more than once stay in their own order."""
+    low = indices.min(axis=0, initial=0)
+    if np.subtract(indices.max(axis=0, initial=0), low, dtype=np.int64).max() > np.iinfo(np.uint16).max:
+        return np.lexsort(indices.T[::-1])
+    x, y, z = (indices - low).astype(np.uint16).T  # numbers as small as these NumPy sorts by counting
+    order = np.argsort(z, kind="stable")
+    for axis in (y, x):
+        order = order[np.argsort(axis[order], kind="stable")]
+    return order
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ the two sides are called a and b. What isn't known keeps its number.
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -31,6 +32,7 @@ AUTOMATIC = ("human", "quadruped", "bird")  # a hand may lie anyhow; with few jo
 FITS = 0.5  # fraction of a perfect subject's score that a tree must have for each of its joints
 FAR = 3.0  # standard deviations within which a body lies
 MOST_WORDS = 3  # of parts in one body's name
+KEPT = 4  # names found last, for those who ask again: motion files, their angles, the report
 
 
 @dataclass(frozen=True)
@@ -115,8 +117,35 @@ def find_names(
     """
     if not skeleton.joint_count:
         return FoundNames()
+    if templates is not None:
+        return _find(skeleton, up, surface, list(templates))
+    key = _digest(skeleton, up, surface)
+    found = _found.get(key)
+    if found is None:
+        found = _find(skeleton, up, surface, [read_template(name) for name in AUTOMATIC])
+        _found[key] = found
+        for old in list(_found)[:-KEPT]:
+            _found.pop(old, None)
+    return found
+
+
+_found: dict[bytes, FoundNames] = {}  # by the digest of all that they follow from
+
+
+def _digest(skeleton: Skeleton, up: int, surface: BodySurface | None) -> bytes:
+    """Digest of what names are found by; those that bodies and joints have don't count."""
+    s = skeleton
+    arrays = [s.joint_positions, s.joint_bodies, s.body_rotations, s.body_positions, s.offsets, s.body_offsets]
+    arrays += [] if surface is None else [surface.points, surface.bodies]
+    digest = hashlib.sha256(repr((up, s.root, s.fixed_joints, s.fps)).encode())
+    for array in arrays:
+        digest.update(f"{array.dtype} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.digest()
+
+
+def _find(skeleton: Skeleton, up: int, surface: BodySurface | None, asked: list[NameTemplate]) -> FoundNames:
     posture = mean_posture(skeleton, up, surface)
-    asked = list(templates) if templates is not None else [read_template(name) for name in AUTOMATIC]
     best: tuple[NameTemplate, list[TreeMatch]] | None = None
     scores: dict[str, float] = {}
     for template in asked:

@@ -17,11 +17,13 @@ from geomocap.evaluation.camera_check import BACKGROUND_FRAMES
 from geomocap.files.capture import Capture
 from geomocap.files.corrected_cameras import CORRECTION, SPARSE_FILES, as_seen, write_cameras
 from geomocap.files.run import stage_key
+from geomocap.files.videos import Video
 from geomocap.model.camera_correction import CameraCorrection
 from geomocap.model.even_choice import evenly_chosen
 from geomocap.pipeline.job import Job
 from geomocap.scheduling import map_items
 from geomocap.silhouettes.background import BackgroundModel, model_from_frames, model_from_plate
+from geomocap.silhouettes.likelihood import Counts
 from geomocap.silhouettes.silhouette_scene import SilhouetteScene, learning_frames
 from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
@@ -75,15 +77,21 @@ def find_correction(job: Job, capture: Capture) -> CameraCorrection:
 
 def _cut_alone(job: Job, capture: Capture, frames: list[int], shrink: int) -> list[tuple[np.ndarray, ...]]:
     """Silhouettes of reduced images, each camera alone."""
-    settings = job.config.silhouettes
-    learn = LearnBackground(capture, settings, shrink)
-    models = list(map_items(learn, capture.cameras, job.executor, "cameras", job.progress, 2))
+    settings, learning = job.config.silhouettes, learning_frames(capture.n_frames)
+    look = _Look(LearnBackground(capture, settings, shrink), tuple(sorted({*frames, *learning})))
+    looks = list(map_items(look, capture.cameras, job.executor, "cameras", job.progress, 2))
+    models = [model for model, _ in looks]
     if shrink == 1:
         job.backgrounds.update(zip(capture.cameras, models, strict=True))
+
+    def moments(numbers: list[int]) -> list[_Moment]:
+        return [_Moment(k, tuple(known.get(k) for _, known in looks)) for k in numbers]
+
     scene = SilhouetteScene.unlearnt(models, None, settings)
     read = _ReadReduced(capture, shrink)
-    scene = scene.learnt(scene.count(read(k)) for k in learning_frames(capture.n_frames))
-    return list(map_items(_CutReduced(read, scene), frames, job.executor, "cameras", job.progress, 4))
+    count, seen = _CountReduced(read, scene), moments(learning)
+    scene = scene.learnt(map_items(count, seen, job.executor, "cameras", job.progress, 4))
+    return list(map_items(_CutReduced(read, scene), moments(frames), job.executor, "cameras", job.progress, 4))
 
 
 def _reduced(image: np.ndarray, shrink: int) -> np.ndarray:
@@ -94,14 +102,25 @@ def _reduced(image: np.ndarray, shrink: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
+class _Moment:
+    """A frame, and of each camera the reduced image if it has been read already."""
+
+    frame: int
+    images: tuple[np.ndarray | None, ...]
+
+
+@dataclass(frozen=True)
 class _ReadReduced:
     """Reduced images of one frame."""
 
     capture: Capture
     shrink: int
 
-    def __call__(self, frame: int) -> list[np.ndarray]:
-        return [_reduced(self.capture.frame(c, frame), self.shrink) for c in self.capture.cameras]
+    def __call__(self, moment: _Moment) -> list[np.ndarray]:
+        return [
+            _reduced(self.capture.frame(c, moment.frame), self.shrink) if image is None else image
+            for c, image in zip(self.capture.cameras, moment.images, strict=True)
+        ]
 
 
 @dataclass(frozen=True)
@@ -114,9 +133,18 @@ class LearnBackground:
 
     def __call__(self, camera: str) -> BackgroundModel:
         """Learn it from frames spread over the recording."""
-        recorded = self.capture.sources[camera]  # also the frames before the subject came in
-        chosen = evenly_chosen(len(recorded), self.settings.samples)
-        frames = [_reduced(recorded.read(int(k)), self.shrink) for k in chosen]
+        return self.learnt(camera, [self.read(camera, k) for k in self.chosen(camera)])
+
+    def chosen(self, camera: str) -> list[int]:
+        """Return the frames to learn from, also of those before the subject came in; numbers in the recording."""
+        return evenly_chosen(len(self.capture.sources[camera]), self.settings.samples).tolist()
+
+    def read(self, camera: str, number: int) -> np.ndarray:
+        """Read a frame of the recording, reduced."""
+        return _reduced(self.capture.sources[camera].read(number), self.shrink)
+
+    def learnt(self, camera: str, frames: list[np.ndarray]) -> BackgroundModel:
+        """Learn it from these frames, reduced."""
         if not self.capture.has_background(camera):
             return model_from_frames(frames, self.settings, camera)
         plate = _reduced(self.capture.background(camera), self.shrink)
@@ -126,11 +154,45 @@ class LearnBackground:
 
 
 @dataclass(frozen=True)
+class _Look:
+    """Background model of one camera; of a video also the reduced images of other frames, so that it is decoded once.
+
+    Attributes
+    ----------
+    learn : LearnBackground
+    frames : tuple of int
+        Those other frames.
+    """
+
+    learn: LearnBackground
+    frames: tuple[int, ...]
+
+    def __call__(self, camera: str) -> tuple[BackgroundModel, dict[int, np.ndarray]]:
+        capture, chosen = self.learn.capture, self.learn.chosen(camera)
+        if not isinstance(capture.sources[camera], Video):
+            return self.learn(camera), {}
+        wanted = {capture.first + k: k for k in self.frames}
+        images = {n: self.learn.read(camera, n) for n in sorted({*chosen, *wanted})}
+        return self.learn.learnt(camera, [images[n] for n in chosen]), {k: images[n] for n, k in wanted.items()}
+
+
+@dataclass(frozen=True)
+class _CountReduced:
+    """What one frame's reduced images tell about subject and background."""
+
+    read: _ReadReduced
+    scene: SilhouetteScene
+
+    def __call__(self, moment: _Moment) -> Counts:
+        return self.scene.count(self.read(moment))
+
+
+@dataclass(frozen=True)
 class _CutReduced:
     """Silhouettes of one frame's reduced images."""
 
     read: _ReadReduced
     scene: SilhouetteScene
 
-    def __call__(self, frame: int) -> tuple[np.ndarray, ...]:
-        return self.scene.silhouettes(self.read(frame))
+    def __call__(self, moment: _Moment) -> tuple[np.ndarray, ...]:
+        return self.scene.silhouettes(self.read(moment))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -56,6 +57,11 @@ class BackgroundModel:
         object.__setattr__(self, "sigma", np.ascontiguousarray(self.sigma, np.float32))
         object.__setattr__(self, "known", np.ascontiguousarray(self.known, bool))
         object.__setattr__(self, "texture", _texture(self.mean, self.sigma))
+
+    @cached_property
+    def log_sigma(self) -> np.ndarray:
+        """Natural logarithm of `sigma`, (H, W) float32."""
+        return logarithms(self.sigma)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -252,6 +258,16 @@ def absolute_misses(image, pixels, mean, gain, offset, frame, misses):
     for i in range(len(pixels)):
         for c in range(3):
             misses[i, frame, c] = abs(image[pixels[i], c] - (gain[c] * mean[i, c] + offset[c]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def logarithms(values):
+    """Natural logarithms of (H, W) float32, as kernels take them: NumPy's own differ in the last place."""
+    out = np.empty_like(values)
+    for y in range(values.shape[0]):
+        for x in range(values.shape[1]):
+            out[y, x] = np.log(values[y, x])
+    return out
 
 
 def _texture(mean: np.ndarray, sigma: np.ndarray) -> np.ndarray:

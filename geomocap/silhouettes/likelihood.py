@@ -188,7 +188,7 @@ def log_odds(
     """
     return _log_odds(
         image,
-        model.sigma,
+        model.log_sigma,
         model.known,
         model.texture,
         misfit,
@@ -205,18 +205,14 @@ LEAST = float(np.log(OUTLIER / 256.0**3))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _log_odds(image, sigma, known, texture, misfit, shade, subject, background, shadow, level, least):
+def _log_odds(image, log_sigma, known, texture, misfit, shade, subject, background, shadow, level, least):
     out = np.empty(known.shape, np.float32)
     for y in range(known.shape[0]):
-        last, tight = np.float32(-1.0), 0.0  # log sigma is the same along a row where there are no edges
         for x in range(known.shape[1]):
             if not known[y, x]:
                 out[y, x] = UNKNOWN
                 continue
-            s = sigma[y, x]
-            if s != last:
-                last = s
-                tight = 3.0 * np.log(s)
+            tight = 3.0 * log_sigma[y, x]
             b = max(background[min(QUARTERS - 1, int(4 * min(misfit[y, x], 1e6)))] - tight, least)
             f = subject[level[image[y, x, 0]], level[image[y, x, 1]], level[image[y, x, 2]]]
             odds = f - b

@@ -23,6 +23,7 @@ from geomocap.naming.name_templates import NamingError, built_in_templates, read
 from geomocap.naming.tree_features import nesting
 from geomocap.naming.tree_matching import match_tree
 from tests.geomocap.articulated import skeleton_arrays, skeleton_of
+from tests.geomocap.assignment_reference import heaviest_choices_python
 from tests.geomocap.template_figures import figure, with_a_thigh_in_two
 
 HUMAN, QUADRUPED, BIRD = (read_template(name) for name in ("human", "quadruped", "bird"))
@@ -45,6 +46,19 @@ def test_heaviest_choices_are_those_of_trying_all():
         assert chosen is not None
         assert weights[chosen].sum() == pytest.approx(best)
         assert heaviest_choices(weights, groups, kinds, excluded, above=best) is None
+
+
+def test_heaviest_choices_are_those_of_the_reference_search():
+    rng = np.random.default_rng(2)
+    for n in (0, 1, 5, 64, 65, 130, 200):
+        for part in (0.02, 0.3):
+            weights, groups, kinds = rng.uniform(0.1, 2, n), rng.integers(0, 12, n), rng.integers(0, 15, n)
+            weights[n // 2 :] = np.round(weights[n // 2 :], 1)  # some are equal
+            excluded = rng.random((n, n)) < part
+            excluded |= excluded.T
+            for above in (-np.inf, 3.0, 20.0):
+                chosen = heaviest_choices(weights, groups, kinds, excluded, above)
+                assert chosen == heaviest_choices_python(weights, groups, kinds, excluded, above)
 
 
 def test_nesting_of_sets():

@@ -51,6 +51,24 @@ def test_files_of_a_run_are_whole(tmp_path):
             check_ply(file)
 
 
+def test_points_with_bodies_are_written_as_open3d_does(tmp_path):
+    rng = np.random.default_rng(0)
+    points = BodyPoints(rng.normal(size=(300, 3)), rng.integers(-1, 60, 300))
+    write_points(tmp_path / "bodies.ply", points)
+    o3d.t.io.write_point_cloud(tmp_path / "open3d.ply", points.to_open3d())
+    assert (tmp_path / "bodies.ply").read_bytes() == (tmp_path / "open3d.ply").read_bytes()
+
+
+@pytest.mark.parametrize("span", [3, 1000, 1 << 20])
+def test_voxels_are_sorted_by_index_and_equal_ones_keep_their_order(span):
+    rng = np.random.default_rng(span)
+    indices, colors = rng.integers(-span, span, (500, 3)).astype(np.int32), rng.integers(0, 255, (500, 3))
+    order = np.lexsort(indices.T[::-1])
+    found = Voxels.sorted(indices, colors.astype(np.uint8), np.zeros(3), 0.1)
+    assert np.array_equal(found.indices, indices[order])
+    assert np.array_equal(found.colors, colors[order])
+
+
 @pytest.mark.parametrize("word", [b"inf", b"1,5", b"x"])
 def test_words_in_place_of_numbers_are_told(tmp_path, word, capfd):
     (tmp_path / "a.ply").write_bytes(HEADER + b" 2\nproperty double x\nend_header\n1.5e-3\n" + word + b"\n")

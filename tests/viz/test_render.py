@@ -203,3 +203,12 @@ def test_marked_tiles_are_those_that_boxes_meet(seed: int, spread: float) -> Non
     across = (low[:, :1] < left + tile) & (high[:, :1] >= left)
     down = (low[:, 1:] < top + tile) & (high[:, 1:] >= top)
     np.testing.assert_array_equal(tiles, (down[:, :, None] & across[:, None, :]).any(axis=0))
+
+
+def test_a_model_of_recoloured_meshes_looks_the_same_whether_they_are_sorted_again_or_not() -> None:
+    view = camera_view(rig(), 0, 60)
+    skin = ball(np.array([0.0, 0.0, 1.0]), 0.4, (200, 0, 0))
+    bones = [ball(np.array([0.1, 0.0, 1.0]), 0.2, (0, 200, 0)), tube(np.array([np.zeros(3), UP]), 0.05, (0, 0, 200))]
+    meshes = [skin.recolored((90, 90, 90)).translucent(0.2), *bones]
+    again = Model(meshes, like=Model([skin]))
+    assert np.array_equal(again.render(view).rgba, Model(meshes).render(view).rgba)
