@@ -33,7 +33,12 @@ class TrackingSettings(Settings):
         description="Patches placed on a frame's whole surface",
         json_schema_extra={"flag": "patches"},
     )
-    radius_px: int = Field(5, ge=2, le=20, description="Half the width of a patch, at most (pixels)")
+    radius_px: int = Field(
+        5,
+        ge=2,
+        le=20,
+        description="Half the width of a patch, at most; of few cameras, see one_camera_up_to, twice that (pixels)",
+    )
     reduction: int | None = Field(
         None,
         ge=1,

@@ -179,12 +179,25 @@ def seed_for_one_camera(
 ) -> Patches:
     """Place new patches where a frame's surface has none, each for the camera that sees it best.
 
-    They stay on the surface as it is given, and only where this must be what the camera sees. Parameters as for
-    `seed_patches`.
+    They stay on the surface as it is given, and only where this must be what the camera sees. First narrow ones; where
+    these hold too little texture to tell how they move, wide ones. Parameters as for `seed_patches`.
     """
     there = view.surface[cKDTree(view.surface).query(taken)[1]]
     points = view.surface[spread(view.surface, spacing, there, rng)]
-    blank, seen, cosine = _blank(points, view, settings, 1, _FACING_ALONE, patch_radii(view, spacing, settings)[1])
+    wide, narrow = patch_radii(view, spacing, settings)
+    patches = Patches.empty((2 * settings.radius_px + 1) ** 2, view.count, len(view.levels))
+    for radius in dict.fromkeys((narrow, wide)):
+        patches = patches.join(_precise_alone(points, view, settings, radius))
+        if len(patches):
+            points = points[cKDTree(patches.positions).query(points)[0] > 0.9 * spacing]
+        if not len(points):
+            break
+    return patches
+
+
+def _precise_alone(points: np.ndarray, view: FrameViews, settings: TrackingSettings, radius_px: int) -> Patches:
+    """Make patches of single cameras at points of the surface (N, 3), where their texture tells how they move."""
+    blank, seen, cosine = _blank(points, view, settings, 1, _FACING_ALONE, radius_px)
     seen &= nothing_behind(view, blank.positions)
     some = seen.any(axis=1)
     patches, reference = _of_best_camera(blank.select(np.flatnonzero(some)), seen[some], cosine[some], view)
