@@ -1,7 +1,10 @@
 """Patches that a single camera sees."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from geomocap.patches.one_camera import image_precision
 from geomocap.patches.patch_settings import TrackingSettings
@@ -60,3 +63,24 @@ def test_precision_is_that_of_least_squares_in_two_dimensions(views):
         residual = template[:, 0].var() * (1 - 0.95**2) * 0.15 * len(template) + 4
         expected = np.sqrt(np.linalg.eigvalsh(residual * np.linalg.inv(A.T @ A))[-1])
         assert got[n] == pytest.approx(expected, rel=1e-3)
+
+
+def test_where_narrow_patches_hold_too_little_texture_there_are_wide_ones(views):
+    plain = replace(views[0], levels=np.float32(0.2) * views[0].levels)  # a fifth of the contrast
+    spacing, none = 0.02, np.zeros((0, 3))  # five pixels
+    settings = TrackingSettings(radius_px=8)
+    seeds = seed_for_one_camera(plain, none, spacing, settings, np.random.default_rng(0))
+    width = np.sqrt(np.isfinite(seeds.shape[:, :, 0]).sum(axis=1))
+    narrow, wide = seeds.positions[width == 11], seeds.positions[width == 17]
+    assert len(narrow) + len(wide) == len(seeds) and len(wide) > 2 * len(narrow) > 0
+    # they stand where the others don't
+    assert cKDTree(narrow).query(wide)[0].min() > 0.7 * spacing
+    only_narrow = settings.model_copy(update={"radius_px": 5})
+    fewer = seed_for_one_camera(plain, none, spacing, only_narrow, np.random.default_rng(0))
+    assert len(fewer) == len(narrow)
+
+
+def test_where_texture_suffices_all_are_narrow(views):
+    settings = TrackingSettings(radius_px=8)
+    seeds = seed_for_one_camera(views[0], np.zeros((0, 3)), 0.02, settings, np.random.default_rng(0))
+    assert (np.isfinite(seeds.shape[:, :, 0]).sum(axis=1) == 11**2).mean() > 0.9
