@@ -34,7 +34,7 @@ _LEAST_CONTACTS = 3
 _LEAST_SEEN = 0.1
 _LEAST_SAMPLES = 3  # that tell a motion
 _LEAST_FRAMES = 5
-_TURN_FRACTION = 0.02  # of the frames, in which a turn may be larger
+TURN_FRACTION = 0.02  # of the frames, in which a turn may be larger
 # Noise turns n samples by three angles, each of variance s²/2 / (n radius²); with the 98th percentile of their χ²:
 _FEIGNED = 9.84 / 2.0
 _CLEARLY = np.deg2rad(40.0)
@@ -242,8 +242,8 @@ def _turn(first: int, second: int, model: BodyModel, evidence: Evidence) -> floa
     if min(evidence.seen[model.label == body, 0].sum() for body in (first, second)) < 3:
         # nothing ties the body to frame 0: its turn counts from the middle of the frames
         at = len(one) // 2
-        return relative_turn(one @ one[at].T, other @ other[at].T, _TURN_FRACTION)
-    turn = relative_turn(one, other, _TURN_FRACTION)
+        return relative_turn(one @ one[at].T, other @ other[at].T, TURN_FRACTION)
+    turn = relative_turn(one, other, TURN_FRACTION)
     if turn > _CLEARLY:
         return turn
     a = np.flatnonzero((model.label == first) & model.core)

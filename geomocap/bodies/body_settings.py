@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from pydantic import Field
 
 from geomocap.settings import Settings
@@ -82,3 +84,7 @@ class MotionBodiesSettings(Settings):
     smoothness: float = Field(
         default=0.3, ge=0, lt=1, description="weight of its neighbours in the choice of a sample's body (0..1)"
     )
+
+    def least_turn(self, rigid: bool) -> float:
+        """Turn of a body against each neighbour, at least, radians; `rigid`: its samples move with rigid parts."""
+        return math.radians(self.part_turn_deg if rigid else self.min_turn_deg)

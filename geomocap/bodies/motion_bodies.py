@@ -95,6 +95,30 @@ class MotionBodies:
         middle = np.stack([self.rest[self.label == b].mean(axis=0) for b in range(self.body_count)])
         return np.einsum("tbij,bj->tbi", self.rotations, middle) + self.translations
 
+    def merged(self, kept: int, gone: int) -> MotionBodies:
+        """Bodies of which one takes the samples of another and carries them by its own motion; later numbers move up.
+
+        Confidence is that of the surer of the two, reliability the mean over their samples.
+        """
+        sizes = np.bincount(self.label[self.label >= 0], minlength=self.body_count)
+        left = np.arange(self.body_count) != gone
+        number = np.cumsum(left) - 1
+        number[gone] = number[kept]
+        weights, reliability, confidence = self.weights.copy(), self.reliability.copy(), self.confidence.copy()
+        weights[:, kept] += weights[:, gone]
+        pair = [kept, gone]
+        reliability[:, kept] = np.average(reliability[:, pair], axis=1, weights=sizes[pair])
+        confidence[kept] = confidence[pair].max()
+        return replace(
+            self,
+            label=np.where(self.label >= 0, number[self.label], -1).astype(np.int32),
+            weights=weights[:, left],
+            rotations=self.rotations[:, left],
+            translations=self.translations[:, left],
+            reliability=reliability[:, left],
+            confidence=confidence[left],
+        )
+
     def alternatives(self, most: int = 8) -> np.ndarray:
         """Bodies of the samples if the criterion were a little weaker or stricter, (A, N) int32, nearest numbers first.
 
@@ -173,8 +197,8 @@ def _those_that_are_there(
 
 def _criterion(settings: MotionBodiesSettings, noise: SurfaceNoise, rigid: bool) -> Criterion:
     """When a body is one; rigid parts turn as a whole, and none that points suit on its own is a piece of soft skin."""
-    turn, softness = (settings.part_turn_deg, 0.0) if rigid else (settings.min_turn_deg, settings.soft_fraction)
-    return Criterion(np.deg2rad(turn), noise, settings.min_fraction, softness)
+    softness = 0.0 if rigid else settings.soft_fraction
+    return Criterion(settings.least_turn(rigid), noise, settings.min_fraction, softness)
 
 
 def _result(

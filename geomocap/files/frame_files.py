@@ -21,13 +21,7 @@ from geomocap.reading import open_plain, read_bytes
 
 def write_voxels(path: Path, voxels: Voxels) -> None:
     """Write voxels as the PLY of an Open3D voxel grid, whole or not at all."""
-    grid = voxels.to_open3d()
-    write_atomic(
-        path,
-        write_by_open3d(o3d.io.write_voxel_grid, grid, _VOXEL.itemsize * len(voxels.indices)),
-        is_whole_ply,
-        lasting=False,
-    )
+    write_bytes(path, _voxel_file(voxels), lasting=False)
 
 
 def read_voxels(path: Path) -> Voxels:
@@ -119,7 +113,7 @@ def ply_count(path: Path) -> int:
     return int(match[1]) if match else 0
 
 
-_HEADER = b"""ply
+_VOXEL_HEADER = b"""ply
 format binary_little_endian 1.0
 comment Created by Open3D
 element origin 1
@@ -128,7 +122,36 @@ property double y
 property double z
 element rotation 1
 """
+_VOXEL_PROPERTIES = """property double r00
+property double r01
+property double r02
+property double r10
+property double r11
+property double r12
+property double r20
+property double r21
+property double r22
+element voxel_size 1
+property double val
+element vertex {}
+property double x
+property double y
+property double z
+property uchar red
+property uchar green
+property uchar blue
+end_header
+"""
 _VOXEL = np.dtype([("index", "<f8", 3), ("color", "u1", 3)])
+
+
+def _voxel_file(voxels: Voxels) -> bytes:
+    """Return what Open3D writes of `voxels.to_open3d()`, which takes it ten times as long, but sorted by index."""
+    rows = np.empty(len(voxels.indices), _VOXEL)
+    rows["index"], rows["color"] = voxels.indices, voxels.colors
+    frame = np.array([*voxels.origin, *np.eye(3).ravel(), voxels.voxel_size], "<f8")
+    header = _VOXEL_HEADER + _VOXEL_PROPERTIES.format(len(rows)).encode()
+    return header + frame.tobytes() + rows.tobytes()
 
 
 def _read_binary(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
@@ -138,7 +161,7 @@ def _read_binary(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]
     lines = head.decode("ascii", "replace").splitlines()
     vertex = [line for line in lines if line.startswith("element vertex ")]
     properties = [line for line in lines[lines.index(vertex[0]) + 1 :]] if vertex else []
-    if not data.startswith(_HEADER) or properties != [
+    if not data.startswith(_VOXEL_HEADER) or properties != [
         "property double x",
         "property double y",
         "property double z",
