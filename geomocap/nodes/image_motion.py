@@ -19,6 +19,7 @@ from geomocap.nodes.correspondences import Target, pull
 from geomocap.nodes.deformation import BlockPattern, step
 from geomocap.nodes.image_pull import HALF, LEAST_COSINE, FrameImages, window_pulls
 from geomocap.nodes.node_graph import NodeGraph
+from geomocap.nodes.surface_coverage import SMALLEST_PIECE
 
 EARLIER = (1, 4, 16)
 """Frames before the present one that its images are compared with, besides the reference frame."""
@@ -172,8 +173,9 @@ class ImageMotion:
                 return
 
     def _apart(self, one: NodeState, other: NodeState) -> np.ndarray:
-        """Nodes that are clearly elsewhere in two states, (N,) bool."""
-        return np.linalg.norm(one[0] - other[0], axis=1) > _APART * self.graph.spacing
+        """Nodes that are clearly elsewhere in two states, (N,) bool; none if they are fewer than the smallest limb."""
+        apart = np.linalg.norm(one[0] - other[0], axis=1) > _APART * self.graph.spacing
+        return apart & (apart.mean() >= SMALLEST_PIECE)
 
     def _better(self, frame: Target, found: list[tuple[NodeState, np.ndarray]]) -> int:
         """Return which state leaves least of the points and of the images unexplained and is strained least.
@@ -258,37 +260,41 @@ class ImageMotion:
         spread = _SPREAD[level] * pixel
         own = 0.9 * self.graph.spacing**2 * len(self.graph.nodes) / S
         once = np.minimum(own / ((2 * HALF + 1) * spread) ** 2 * np.maximum(cosine, LEAST_COSINE), 1.0)
-        errors = np.full((len(earlier), S, C), np.nan)
-        for k, then in enumerate(earlier):
-            more, pulled = np.zeros((S, C, 3, 3)), np.zeros((S, C, 3))
-            total, count = np.zeros((S, C)), np.zeros((S, C), np.int64)
-            window_pulls(
-                images.levels[level],
-                then.images.levels[level],
-                images.projections,
-                then.images.projections,
-                images.masks,
-                then.images.masks,
-                y,
-                axes,
-                then.places,
-                then.axes,
-                spread,
-                (cosine > 0) & (then.cosine > 0),
-                HALF,
-                more,
-                pulled,
-                total,
-                count,
-            )
-            known = count > 0
+        # always as many earlier frames, so that the kernel is one: the last is repeated, and not looked at
+        count = len(earlier)
+        padded = earlier + [earlier[-1]] * (len(EARLIER) + 1 - count)
+        seen = np.stack([(cosine > 0) & (then.cosine > 0) & (k < count) for k, then in enumerate(padded)])
+        more, pulled = np.zeros((len(padded), S, C, 3, 3)), np.zeros((len(padded), S, C, 3))
+        total, pixels = np.zeros((len(padded), S, C)), np.zeros((len(padded), S, C), np.int64)
+        window_pulls(
+            images.levels[level],
+            images.projections,
+            images.masks,
+            tuple(then.images.levels[level] for then in padded),
+            tuple(then.images.projections for then in padded),
+            tuple(then.images.masks for then in padded),
+            y,
+            axes,
+            np.stack([then.places for then in padded]),
+            np.stack([then.axes for then in padded]),
+            spread,
+            seen,
+            HALF,
+            more,
+            pulled,
+            total,
+            pixels,
+        )
+        errors = np.full((count, S, C), np.nan)
+        for k in range(count):
+            known = pixels[k] > 0
             if not known.any():
                 continue
-            mean = total / np.maximum(count, 1)
+            mean = total[k] / np.maximum(pixels[k], 1)
             usual = max(float(np.median(mean[known])), _LEAST)
             weight = np.where(known, once / (1 + mean / (_DEPARTED * usual)) ** 2, 0.0) * noise**2 / usual
-            A += (weight[:, None] @ more.reshape(S, C, 9)).reshape(S, 3, 3)
-            b += (weight[:, None] @ pulled)[:, 0]
+            A += (weight[:, None] @ more[k].reshape(S, C, 9)).reshape(S, 3, 3)
+            b += (weight[:, None] @ pulled[k])[:, 0]
             errors[k][known] = mean[known]
         return errors
 

@@ -151,116 +151,132 @@ def _project_window(P, y, e, step, middle, row, column):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def window_pulls(now, then, P, Q, mask_now, mask_then, y, e, y0, e0, step, seen, half, A, b, error, count):
-    """Gather what the windows of all samples in all cameras ask, with σ = 1.
+def window_pulls(now, P, mask_now, then, Q, mask_then, y, e, y0, e0, step, seen, half, A, b, error, count):
+    """Gather what the windows of all samples in all cameras ask against K earlier frames, with σ = 1.
 
     Parameters
     ----------
-    now, then : (C, h, w), (C, h', w') float32
-        Images of this frame and of the earlier one.
-    P, Q : (C, 3, 4) float
-        Their projections.
-    mask_now, mask_then : (C, h, w), (C, h', w') uint8
+    now, mask_now : (C, h, w) float32, uint8
+        Images and silhouettes of this frame.
+    P : (C, 3, 4) float
+        Its projections.
+    then, Q, mask_then : tuple of K
+        The same of earlier frames, whose images may have other sizes.
     y, e : (S, 3), (S, 2, 3) float
         Samples of this frame's surface and two axes of their tangent planes.
-    y0, e0 : (S, 3), (S, 2, 3) float
-        The same of the earlier frame.
+    y0, e0 : (K, S, 3), (K, S, 2, 3) float
+        The same of the earlier frames.
     step : (S, C) float
         Distance of a window's pixels on the surface.
-    seen : (S, C) bool
+    seen : (K, S, C) bool
         Which windows to compare.
     half : int
-    A, b : (S, C, 3, 3), (S, C, 3) float, out
+    A, b : (K, S, C, 3, 3), (K, S, C, 3) float, out
         Weights of the samples' places, and these times their errors.
-    error : (S, C) float, out
+    error : (K, S, C) float, out
         Sum of the squared differences.
-    count : (S, C) int, out
+    count : (K, S, C) int, out
         Pixels compared; 0: too few.
     """
-    size = (2 * half + 1) ** 2
-    g = np.empty((size, 3))
-    r = np.empty(size)
+    side = 2 * half + 1
+    size = side**2
+    value, slope, on = np.empty(size), np.empty((size, 3)), np.empty(size, np.bool_)
+    r, which = np.empty(size), np.empty(size, np.int64)
+    across = np.empty((size, 2))
+    for n in range(size):
+        across[n, 0], across[n, 1] = n // side - half, n % side - half
     # places on the images are quotients of what is linear in the window's rows and columns
-    o0, i0, j0 = np.empty(3), np.empty(3), np.empty(3)
-    o1, i1, j1 = np.empty(3), np.empty(3), np.empty(3)
+    o, di, dj = np.empty(3), np.empty(3), np.empty(3)
     height, width = mask_now.shape[1:]
-    height0, width0 = mask_then.shape[1:]
     for s in range(len(y)):
         for c in range(len(P)):
-            count[s, c] = 0
-            if not seen[s, c]:
+            wanted = False
+            for k in range(len(then)):
+                count[k, s, c] = 0
+                wanted |= seen[k, s, c]
+            if not wanted:
                 continue
-            _project_window(Q[c], y0[s], e0[s], step[s, c], o0, i0, j0)
-            _project_window(P[c], y[s], e[s], step[s, c], o1, i1, j1)
+            # this frame's values, and how they change with the sample's place
+            _project_window(P[c], y[s], e[s], step[s, c], o, di, dj)
             image = now[c]
-            n = 0
-            mr, m0, m1, m2 = 0.0, 0.0, 0.0, 0.0
-            for i in range(-half, half + 1):
-                for j in range(-half, half + 1):
-                    w = o0[2] + i * i0[2] + j * j0[2]
+            for n in range(size):
+                i, j = across[n, 0], across[n, 1]
+                on[n] = False
+                w = o[2] + i * di[2] + j * dj[2]
+                if w <= 0:
+                    continue
+                w = 1.0 / w
+                u, v = w * (o[0] + i * di[0] + j * dj[0]), w * (o[1] + i * di[1] + j * dj[1])
+                if not (u >= 1 and v >= 1 and u < width - 2 and v < height - 2):
+                    continue
+                if mask_now[c, int(v + 0.5), int(u + 0.5)] == 0:
+                    continue
+                on[n] = True
+                # value and half the central differences there, all bilinear
+                row, col = int(v), int(u)
+                a, d = u - col, v - row
+                p, q = 1 - a, 1 - d
+                f00, f01 = image[row, col], image[row, col + 1]
+                f10, f11 = image[row + 1, col], image[row + 1, col + 1]
+                value[n] = q * (p * f00 + a * f01) + d * (p * f10 + a * f11)
+                gx = q * (p * (f01 - image[row, col - 1]) + a * (image[row, col + 2] - f00))
+                gx += d * (p * (f11 - image[row + 1, col - 1]) + a * (image[row + 1, col + 2] - f10))
+                gy = p * (q * (f10 - image[row - 1, col]) + d * (image[row + 2, col] - f00))
+                gy += a * (q * (f11 - image[row - 1, col + 1]) + d * (image[row + 2, col + 1] - f01))
+                gx, gy = 0.5 * gx * w, 0.5 * gy * w
+                for m in range(3):
+                    slope[n, m] = gx * (P[c, 0, m] - u * P[c, 2, m]) + gy * (P[c, 1, m] - v * P[c, 2, m])
+            for k in range(len(then)):
+                if not seen[k, s, c]:
+                    continue
+                _project_window(Q[k][c], y0[k, s], e0[k, s], step[s, c], o, di, dj)
+                before, mask = then[k][c], mask_then[k][c]
+                high, wide = mask.shape
+                found = 0
+                mr, m0, m1, m2 = 0.0, 0.0, 0.0, 0.0
+                for n in range(size):
+                    if not on[n]:
+                        continue
+                    i, j = across[n, 0], across[n, 1]
+                    w = o[2] + i * di[2] + j * dj[2]
                     if w <= 0:
                         continue
                     w = 1.0 / w
-                    u, v = w * (o0[0] + i * i0[0] + j * j0[0]), w * (o0[1] + i * i0[1] + j * j0[1])
-                    if not (u >= 0 and v >= 0 and u < width0 - 1 and v < height0 - 1):
+                    u, v = w * (o[0] + i * di[0] + j * dj[0]), w * (o[1] + i * di[1] + j * dj[1])
+                    if not (u >= 0 and v >= 0 and u < wide - 1 and v < high - 1):
                         continue
-                    if mask_then[c, int(v + 0.5), int(u + 0.5)] == 0:
+                    if mask[int(v + 0.5), int(u + 0.5)] == 0:
                         continue
-                    before = _value(then[c], u, v)
-                    w = o1[2] + i * i1[2] + j * j1[2]
-                    if w <= 0:
-                        continue
-                    w = 1.0 / w
-                    u, v = w * (o1[0] + i * i1[0] + j * j1[0]), w * (o1[1] + i * i1[1] + j * j1[1])
-                    if not (u >= 1 and v >= 1 and u < width - 2 and v < height - 2):
-                        continue
-                    if mask_now[c, int(v + 0.5), int(u + 0.5)] == 0:
-                        continue
-                    # value and half the central differences there, all bilinear
-                    row, col = int(v), int(u)
-                    a, d = u - col, v - row
-                    p, q = 1 - a, 1 - d
-                    f00, f01, f10, f11 = (
-                        image[row, col],
-                        image[row, col + 1],
-                        image[row + 1, col],
-                        image[row + 1, col + 1],
-                    )
-                    r[n] = q * (p * f00 + a * f01) + d * (p * f10 + a * f11) - before
-                    gx = q * (p * (f01 - image[row, col - 1]) + a * (image[row, col + 2] - f00))
-                    gx += d * (p * (f11 - image[row + 1, col - 1]) + a * (image[row + 1, col + 2] - f10))
-                    gy = p * (q * (f10 - image[row - 1, col]) + d * (image[row + 2, col] - f00))
-                    gy += a * (q * (f11 - image[row - 1, col + 1]) + d * (image[row + 2, col + 1] - f01))
-                    gx, gy = 0.5 * gx * w, 0.5 * gy * w
-                    for k in range(3):
-                        g[n, k] = gx * (P[c, 0, k] - u * P[c, 2, k]) + gy * (P[c, 1, k] - v * P[c, 2, k])
-                    mr += r[n]
-                    m0 += g[n, 0]
-                    m1 += g[n, 1]
-                    m2 += g[n, 2]
-                    n += 1
-            if n < _LEAST_FILLED * size:
-                continue
-            count[s, c] = n
-            mr, m0, m1, m2 = mr / n, m0 / n, m1 / n, m2 / n
-            total = 0.0
-            b0, b1, b2 = 0.0, 0.0, 0.0
-            a00, a01, a02, a11, a12, a22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for k in range(n):
-                g0, g1, g2, d = g[k, 0] - m0, g[k, 1] - m1, g[k, 2] - m2, r[k] - mr
-                total += d * d
-                b0 += g0 * d
-                b1 += g1 * d
-                b2 += g2 * d
-                a00 += g0 * g0
-                a01 += g0 * g1
-                a02 += g0 * g2
-                a11 += g1 * g1
-                a12 += g1 * g2
-                a22 += g2 * g2
-            error[s, c] = total
-            b[s, c, 0], b[s, c, 1], b[s, c, 2] = b0, b1, b2
-            A[s, c, 0, 0], A[s, c, 1, 1], A[s, c, 2, 2] = a00, a11, a22
-            A[s, c, 0, 1] = A[s, c, 1, 0] = a01
-            A[s, c, 0, 2] = A[s, c, 2, 0] = a02
-            A[s, c, 1, 2] = A[s, c, 2, 1] = a12
+                    r[found] = value[n] - _value(before, u, v)
+                    which[found] = n
+                    mr += r[found]
+                    m0 += slope[n, 0]
+                    m1 += slope[n, 1]
+                    m2 += slope[n, 2]
+                    found += 1
+                if found < _LEAST_FILLED * size:
+                    continue
+                count[k, s, c] = found
+                mr, m0, m1, m2 = mr / found, m0 / found, m1 / found, m2 / found
+                total = 0.0
+                b0, b1, b2 = 0.0, 0.0, 0.0
+                a00, a01, a02, a11, a12, a22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                for h in range(found):
+                    n = which[h]
+                    g0, g1, g2, d = slope[n, 0] - m0, slope[n, 1] - m1, slope[n, 2] - m2, r[h] - mr
+                    total += d * d
+                    b0 += g0 * d
+                    b1 += g1 * d
+                    b2 += g2 * d
+                    a00 += g0 * g0
+                    a01 += g0 * g1
+                    a02 += g0 * g2
+                    a11 += g1 * g1
+                    a12 += g1 * g2
+                    a22 += g2 * g2
+                error[k, s, c] = total
+                b[k, s, c, 0], b[k, s, c, 1], b[k, s, c, 2] = b0, b1, b2
+                A[k, s, c, 0, 0], A[k, s, c, 1, 1], A[k, s, c, 2, 2] = a00, a11, a22
+                A[k, s, c, 0, 1] = A[k, s, c, 1, 0] = a01
+                A[k, s, c, 0, 2] = A[k, s, c, 2, 0] = a02
+                A[k, s, c, 1, 2] = A[k, s, c, 2, 1] = a12

@@ -121,36 +121,36 @@ def test_windows_pull_as_the_reference_says(views: list[BallViews]):
     axes = np.stack([first, np.cross(n, first)], axis=1)
     cosine, pixel = now.look(y, n)
     S, C = cosine.shape
-    A, b, error = np.zeros((S, C, 3, 3)), np.zeros((S, C, 3)), np.zeros((S, C))
-    count = np.zeros((S, C), np.int64)
+    others = [then, FrameImages.of(views[2])]
+    A, b, error = np.zeros((2, S, C, 3, 3)), np.zeros((2, S, C, 3)), np.zeros((2, S, C))
+    count = np.zeros((2, S, C), np.int64)
     window_pulls(
         now.levels[1],
-        then.levels[1],
         now.projections,
-        then.projections,
         now.masks,
-        then.masks,
+        tuple(other.levels[1] for other in others),
+        tuple(other.projections for other in others),
+        tuple(other.masks for other in others),
         y,
         axes,
-        y,
-        axes,
+        np.stack([y, y]),
+        np.stack([axes, axes]),
         pixel,
-        cosine > 0,
+        np.stack([cosine > 0, cosine > 0.5]),
         HALF,
         A,
         b,
         error,
         count,
     )
-    compared = 0
-    for s, c in np.argwhere(count > 0):
-        more, pulled, total, pixels = reference_pull(now, then, y[s], axes[s], pixel[s, c], c)
-        assert pixels == count[s, c]
-        np.testing.assert_allclose(A[s, c], more, rtol=1e-6, atol=1e-6 * np.abs(more).max())
-        np.testing.assert_allclose(b[s, c], pulled, rtol=1e-6, atol=1e-6 * np.abs(pulled).max())
-        assert error[s, c] == pytest.approx(total, rel=1e-6)
-        compared += 1
-    assert compared > S
+    assert (count[1] > 0).sum() > S
+    assert not count[1][cosine <= 0.5].any()
+    for k, s, c in np.argwhere(count > 0):
+        more, pulled, total, pixels = reference_pull(now, others[k], y[s], axes[s], pixel[s, c], c)
+        assert pixels == count[k, s, c]
+        np.testing.assert_allclose(A[k, s, c], more, rtol=1e-6, atol=1e-6 * np.abs(more).max())
+        np.testing.assert_allclose(b[k, s, c], pulled, rtol=1e-6, atol=1e-6 * np.abs(pulled).max())
+        assert error[k, s, c] == pytest.approx(total, rel=1e-6)
 
 
 def reference_pull(

@@ -92,3 +92,22 @@ def test_reading_prints_nothing_and_leaves_the_verbosity(tmp_path, capfd):
     (tmp_path / "a.pcd").write_text("nonsense")
     assert not read_by_open3d(o3d.io.read_point_cloud, tmp_path / "a.pcd").has_points()
     assert "".join(capfd.readouterr()) == "" and o3d.utility.get_verbosity_level() == before
+
+
+def test_open3d_reads_voxels_as_it_does_its_own(tmp_path):
+    rng = np.random.default_rng(0)
+    indices = np.unique(rng.integers(0, 40, (300, 3)), axis=0).astype(np.int32)
+    colors = rng.integers(0, 256, indices.shape).astype(np.uint8)
+    voxels = Voxels(indices, colors, np.array([-0.3, 2.0, 1e-7]), 0.0123)
+    write_voxels(tmp_path / "voxels.ply", voxels)
+    o3d.io.write_voxel_grid(str(tmp_path / "open3d.ply"), voxels.to_open3d())
+    ours, theirs = (
+        Voxels.from_open3d(o3d.io.read_voxel_grid(str(tmp_path / name))) for name in ("voxels.ply", "open3d.ply")
+    )
+    assert np.array_equal(ours.indices, theirs.indices)
+    assert np.array_equal(ours.colors, theirs.colors)
+    assert np.array_equal(ours.origin, theirs.origin)
+    assert ours.voxel_size == theirs.voxel_size
+    ours, theirs = ((tmp_path / name).read_bytes() for name in ("voxels.ply", "open3d.ply"))
+    start = len(ours) - 27 * len(indices)
+    assert ours[:start] == theirs[:start]  # headers; voxels follow in another order
