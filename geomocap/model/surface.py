@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import open3d as o3d
+from numba import njit
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -127,8 +128,42 @@ def plane_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:
     near : (M, k) int
         Points of each plane.
     """
-    local = points[near] - points[near].mean(axis=1, keepdims=True)
-    return np.linalg.eigh(np.einsum("mki,mkj->mij", local, local))[1][:, :, 0]
+    return np.linalg.eigh(scatter(np.ascontiguousarray(points, float), near))[1][:, :, 0]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def scatter(points, near):
+    """Sums (M, 3, 3) of the squared distances from their middle, by direction, of some of N points (N, 3) each.
+
+    Parameters
+    ----------
+    points : (N, 3) float64
+    near : (M, k) int64
+        Points of each sum.
+    """
+    count, k = near.shape
+    result = np.empty((count, 3, 3))
+    for m in range(count):
+        x = y = z = 0.0
+        for i in range(k):
+            x += points[near[m, i], 0]
+            y += points[near[m, i], 1]
+            z += points[near[m, i], 2]
+        x, y, z = x / k, y / k, z / k
+        xx = xy = xz = yy = yz = zz = 0.0
+        for i in range(k):
+            a, b, c = points[near[m, i], 0] - x, points[near[m, i], 1] - y, points[near[m, i], 2] - z
+            xx += a * a
+            xy += a * b
+            xz += a * c
+            yy += b * b
+            yz += b * c
+            zz += c * c
+        result[m, 0, 0], result[m, 1, 1], result[m, 2, 2] = xx, yy, zz
+        result[m, 0, 1] = result[m, 1, 0] = xy
+        result[m, 0, 2] = result[m, 2, 0] = xz
+        result[m, 1, 2] = result[m, 2, 1] = yz
+    return result
 
 
 def outward_normals(points: np.ndarray, at: np.ndarray | None = None) -> np.ndarray:

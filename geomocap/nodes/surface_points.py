@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import coo_matrix, csr_matrix
+from numba import njit
+from scipy.sparse import coo_matrix, csr_matrix, triu
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
@@ -142,7 +143,7 @@ def oriented_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:
     i, j = np.repeat(np.arange(M), k - 1), near[:, 1:].ravel()
     cost = 1 - np.abs((normals[i] * normals[j]).sum(axis=1)) + 1e-6
     graph = csr_matrix((cost, (i, j)), (M, M))
-    tree = minimum_spanning_tree(graph.maximum(graph.T))
+    tree = minimum_spanning_tree(triu(graph.maximum(graph.T)))  # each edge once: half of what has to be sorted
     tree = tree + tree.T
     n_parts, part = connected_components(tree, directed=False)
     for first in np.unique(part, return_index=True)[1][:n_parts]:
@@ -171,14 +172,38 @@ def feature_gradients(points: np.ndarray, normals: np.ndarray, near: np.ndarray,
     """
     if features.shape[1] == 0:
         return np.zeros((len(points), 0, 3))
-    offset = points[near] - points[:, None]
-    offset -= np.einsum("mki,mi->mk", offset, normals)[..., None] * normals[:, None]
-    A = np.einsum("mki,mkj->mij", offset, offset)
+    A, right = _tangent_sums(points, normals, near, np.ascontiguousarray(features, float))
     scale = np.trace(A, axis1=1, axis2=2)[:, None, None]
     # the normal direction is held at zero
-    A = A + scale * (np.einsum("mi,mj->mij", normals, normals) + 1e-3 * np.eye(3))
-    difference = features[near] - features[:, None]
-    return np.linalg.solve(A, np.einsum("mki,mkf->mif", offset, difference)).transpose(0, 2, 1)
+    A += scale * (normals[:, :, None] * normals[:, None] + 1e-3 * np.eye(3))
+    return np.linalg.solve(A, right).transpose(0, 2, 1)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _tangent_sums(points, normals, near, features):
+    """Normal equations of features (M, F) on the tangent plane of each point: (M, 3, 3) and (M, 3, F).
+
+    Sums over the neighbours `near` (M, k), of offsets without their part along the normal (M, 3).
+    """
+    count, k = near.shape
+    F = features.shape[1]
+    A, right = np.zeros((count, 3, 3)), np.zeros((count, 3, F))
+    offset = np.empty(3)
+    for m in range(count):
+        for i in range(k):
+            other = near[m, i]
+            along = 0.0
+            for d in range(3):
+                offset[d] = points[other, d] - points[m, d]
+                along += offset[d] * normals[m, d]
+            for d in range(3):
+                offset[d] -= along * normals[m, d]
+            for d in range(3):
+                for e in range(3):
+                    A[m, d, e] += offset[d] * offset[e]
+                for f in range(F):
+                    right[m, d, f] += offset[d] * (features[other, f] - features[m, f])
+    return A, right
 
 
 def surface_graph(points: np.ndarray, normals: np.ndarray, neighbours: int) -> csr_matrix:
