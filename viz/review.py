@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 
@@ -107,46 +110,74 @@ def review(
     desk.step()
     turns = None if stage is None else turntable(results, stage)
     desk.step()
-    head = [*preview_note(results), *changed_files(results), *verdict(results), *summary(quality)]
-    parts = [
-        section("Result", [*head, *_result(results, stage, chosen, turns, desk, Look(samples=1 if quick else 2))]),
-        section("What went in", _inputs(results, stage, chosen, desk)),
-        section("Silhouettes", _silhouettes(results, quality, chosen, desk)),
-        section("Volume and points", _volume(results, stage, chosen, desk)),
-        section("Surface measurement", _clouds(results, measured, chosen, desk)),
-        section("Surface points through time", _tracks(results, stage, chosen, desk)),
-        section("Ellipsoids and their paths", _ellipsoids(results, stage, chosen, desk)),
-        section("Rigid bodies", _bodies(results, stage, chosen, desk)),
-        section("How the bodies were told apart", _separation(results, stage, desk)),
-        section("Skeleton and motion", _skeleton(results, stage, quality, chosen, desk)),
-        section("Key-points", _keypoints(results, stage, chosen, desk)),
-        section("Quality", figures_of_quality(results, quality)),
-        section("Time", _times(results, desk)),
-        section("Settings and versions", record_blocks(results)),
-    ]
+    look = Look(samples=1 if quick else 2)
+    with _filmed(results, stage, desk.folder / "motion.mp4", look, progress) as film:
+        parts = [
+            section("What went in", _inputs(results, stage, chosen, desk)),
+            section("Silhouettes", _silhouettes(results, quality, chosen, desk)),
+            section("Volume and points", _volume(results, stage, chosen, desk)),
+            section("Surface measurement", _clouds(results, measured, chosen, desk)),
+            section("Surface points through time", _tracks(results, stage, chosen, desk)),
+            section("Ellipsoids and their paths", _ellipsoids(results, stage, chosen, desk)),
+            section("Rigid bodies", _bodies(results, stage, chosen, desk)),
+            section("How the bodies were told apart", _separation(results, stage, desk)),
+            section("Skeleton and motion", _skeleton(results, stage, quality, chosen, desk)),
+            section("Key-points", _keypoints(results, stage, chosen, desk)),
+            section("Quality", figures_of_quality(results, quality)),
+            section("Time", _times(results, desk)),
+            section("Settings and versions", record_blocks(results)),
+        ]
+        head = [*preview_note(results), *changed_files(results), *verdict(results), *summary(quality)]
+        parts.insert(0, section("Result", [*head, *_result(results, stage, chosen, turns, desk, film)]))
     page = desk.folder / "report.html"
     write_report(page, Report(title(results), lead(results), key_figures(results), tuple(parts), turns))
     progress("review", desk.total, desk.total)
     return [*desk.written, page]
 
 
+@contextmanager
+def _filmed(
+    results: Results, stage: ViewStage | None, path: Path, look: Look, progress: Progress
+) -> Iterator[Callable[[], Path | None]]:
+    """Make the film beside the rest of the review, most of which keeps one core busy.
+
+    Gives what waits for it; None: there is nothing to film. Leaving before ends it with the picture at hand.
+    """
+    if stage is None or len(results.frames) < 2:
+        yield lambda: None
+        return
+    left = Event()
+
+    def report(name: str, done: int, total: int) -> None:
+        if left.is_set():
+            raise RunError(f"{path}: given up")
+        progress(name, done, total)
+
+    def make() -> Path:
+        motion_video(results, stage, path, progress=report, look=look)
+        return path
+
+    with ThreadPoolExecutor(1) as beside:
+        film = beside.submit(make)
+        try:
+            yield film.result
+        finally:
+            left.set()
+
+
 def _result(
-    results: Results, stage: ViewStage | None, frames: list[int], turns: Turntable | None, desk: Desk, film: Look
+    results: Results,
+    stage: ViewStage | None,
+    frames: list[int],
+    turns: Turntable | None,
+    desk: Desk,
+    film: Callable[[], Path | None],
 ) -> list[Block]:
     if stage is None:
         return [missing("The run holds no geometry yet, so there is no result to show; the silhouettes are below.")]
     blocks: list[Block] = []
     if turns is not None:
         blocks.append(turning(sheets.still(results, stage, frames[len(frames) // 2]), "The subject"))
-    if len(results.frames) > 1:
-        path = desk.folder / "motion.mp4"
-        motion_video(results, stage, path, progress=desk.progress, look=film)
-        desk.written.append(path)
-        over = ", and over the image of one camera" if _calibrated(results) else ""
-        words = "Look for limbs that keep their colour, joints that stay inside the volume, and bones that don't jump."
-        told = f"From a slowly turning free view{over}. {words}"
-        blocks.append(video(path, "The motion", told, folded=turns is not None))
-    desk.step()
     rows: list[tuple[str, sheets.Builder]] = []
     if {"voxels", "cloud"} & set(results.kinds):
         rows.append(("volume" if "voxels" in results.kinds else "points", sheets.volume_meshes))
@@ -160,7 +191,16 @@ def _result(
         "Each column is a frame, each row a stage of the work, seen from the same place. "
         "A body has the same colour in every picture of this report."
     )
-    return blocks + desk.sheet("stages", sheets.story_sheet(results, stage, frames, rows), "Stage by stage", words)
+    stages = desk.sheet("stages", sheets.story_sheet(results, stage, frames, rows), "Stage by stage", words)
+    path = film()
+    if path is not None:
+        desk.written.append(path)
+        over = ", and over the image of one camera" if _calibrated(results) else ""
+        words = "Look for limbs that keep their colour, joints that stay inside the volume, and bones that don't jump."
+        told = f"From a slowly turning free view{over}. {words}"
+        blocks.append(video(path, "The motion", told, folded=turns is not None))
+    desk.step()
+    return blocks + stages
 
 
 def _inputs(results: Results, stage: ViewStage | None, frames: list[int], desk: Desk) -> list[Block]:
