@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
+from threading import Event
 
 import av
 import cv2
@@ -135,3 +138,34 @@ def motion_video(
     with threads() as executor:
         drawn = map_items(draw, list(enumerate(frames)), executor, "video", progress, ahead=6)
         write_video(path, drawn, fps)
+
+
+@contextmanager
+def filmed_beside(
+    results: Results, stage: ViewStage | None, path: Path, progress: Progress = silent, look: Look | None = None
+) -> Iterator[Callable[[], Path | None]]:
+    """Make the film beside other work of the block, most of which keeps one core busy; see `motion_video`.
+
+    Gives a function that waits for the film and returns its path; None: there is nothing to film. If the block ends
+    earlier, the film is given up.
+    """
+    if stage is None or len(results.frames) < 2:
+        yield lambda: None
+        return
+    left = Event()
+
+    def report(name: str, done: int, total: int) -> None:
+        if left.is_set():
+            raise RunError(f"{path}: given up")
+        progress(name, done, total)
+
+    def make() -> Path:
+        motion_video(results, stage, path, progress=report, look=look)
+        return path
+
+    with ThreadPoolExecutor(1) as beside:
+        film = beside.submit(make)
+        try:
+            yield film.result
+        finally:
+            left.set()

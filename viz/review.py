@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from threading import Event
 
 import numpy as np
 
@@ -20,7 +17,7 @@ from viz import figures, keypoint_plots, separation, sheets
 from viz import track_pictures as tracks
 from viz.angle_plots import angle_blocks
 from viz.desk import Desk
-from viz.films import motion_video
+from viz.films import filmed_beside
 from viz.keypoint_marks import marks_of_run
 from viz.matching_review import frame_sheet, template_sheet
 from viz.quality_figures import Quality, assess, relative_paths
@@ -111,7 +108,7 @@ def review(
     turns = None if stage is None else turntable(results, stage)
     desk.step()
     look = Look(samples=1 if quick else 2)
-    with _filmed(results, stage, desk.folder / "motion.mp4", look, progress) as film:
+    with filmed_beside(results, stage, desk.folder / "motion.mp4", progress, look) as film:
         parts = [
             section("What went in", _inputs(results, stage, chosen, desk)),
             section("Silhouettes", _silhouettes(results, quality, chosen, desk)),
@@ -133,36 +130,6 @@ def review(
     write_report(page, Report(title(results), lead(results), key_figures(results), tuple(parts), turns))
     progress("review", desk.total, desk.total)
     return [*desk.written, page]
-
-
-@contextmanager
-def _filmed(
-    results: Results, stage: ViewStage | None, path: Path, look: Look, progress: Progress
-) -> Iterator[Callable[[], Path | None]]:
-    """Make the film beside the rest of the review, most of which keeps one core busy.
-
-    Gives what waits for it; None: there is nothing to film. Leaving before ends it with the picture at hand.
-    """
-    if stage is None or len(results.frames) < 2:
-        yield lambda: None
-        return
-    left = Event()
-
-    def report(name: str, done: int, total: int) -> None:
-        if left.is_set():
-            raise RunError(f"{path}: given up")
-        progress(name, done, total)
-
-    def make() -> Path:
-        motion_video(results, stage, path, progress=report, look=look)
-        return path
-
-    with ThreadPoolExecutor(1) as beside:
-        film = beside.submit(make)
-        try:
-            yield film.result
-        finally:
-            left.set()
 
 
 def _result(

@@ -17,9 +17,9 @@ from geomocap.subject.model_following import fit_motion
 from geomocap.subject.subject_model import SubjectModel
 
 # Power of what the paths miss, beside what the model's drawn surface misses of the silhouettes. Of the two results for
-# each of thirteen captures the better was taken with any power from 0.15 to 0.9 in eleven, with 0 in eight; in one of
-# the other two neither was better. Two of the captures were looked at after the number was set.
-_PATHS = 0.5
+# each of fourteen captures the better was taken with any power from 0.15 to 0.48 in twelve, with 0.5 in eleven, with 0
+# in eight; in one of the others neither was better.
+_PATHS = 0.3
 
 
 def make_model(job: Job, geometry: Geometry, motion: Motion) -> SubjectModel | str:
