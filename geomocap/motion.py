@@ -30,8 +30,9 @@ from geomocap.trajectories.selection import spread_out
 
 SAMPLES = 2000  # motion paths that bodies are found from: more cost time and find the same
 _UNSURE_DEG = 30.0  # 3 to 8 with eight cameras; with four that show the bodies 12, in a cluttered room 29
-# Of the least turn of a body, by which two must turn against each other once refined. Two halves of a shield that alone
-# had seemed to turn by 17° turned by 1° then; bodies that are there came out 1° below the least turn.
+# Of the least turn of a body, by which two must turn against each other once refined. Two halves of a shield that had
+# passed as bodies turned by 1° then. With all of it true pieces of trunks went, which came out 1° below: of a horse's
+# paths with 3 mm of noise the core index fell from 0.99 to 0.79. Nothing between was tried.
 _ALIKE = 0.5
 _LABEL_FRAMES = 12  # frames in which tracks that were not sampled are compared with those that were
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
@@ -24,6 +25,8 @@ from viz.rendering import Look, Model
 from viz.run_contents import Results
 from viz.sheets import overlay, picture, tile_size
 from viz.viewpoints import ViewStage
+
+_REPORTED = 0.25  # seconds between two reports while a film is waited for
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, quality: int = 23) -> None:
@@ -146,26 +149,33 @@ def filmed_beside(
 ) -> Iterator[Callable[[], Path | None]]:
     """Make the film beside other work of the block, most of which keeps one core busy; see `motion_video`.
 
-    Gives a function that waits for the film and returns its path; None: there is nothing to film. If the block ends
-    earlier, the film is given up.
+    Gives a function that waits for the film, reports how far it is, and returns its path; None: there is nothing to
+    film. If the block ends earlier, the film is given up.
     """
     if stage is None or len(results.frames) < 2:
         yield lambda: None
         return
     left = Event()
+    reached: deque[tuple[str, int, int]] = deque(maxlen=1)
 
     def report(name: str, done: int, total: int) -> None:
         if left.is_set():
             raise RunError(f"{path}: given up")
-        progress(name, done, total)
-
-    def make() -> Path:
-        motion_video(results, stage, path, progress=report, look=look)
-        return path
+        reached.append((name, done, total))
 
     with ThreadPoolExecutor(1) as beside:
-        film = beside.submit(make)
+        film = beside.submit(motion_video, results, stage, path, progress=report, look=look)
+
+        def finished() -> Path:
+            done = False
+            while not done:  # progress is reported by the thread that began the work
+                done = bool(wait([film], _REPORTED).done)
+                for last in tuple(reached):
+                    progress(*last)
+            film.result()
+            return path
+
         try:
-            yield film.result
+            yield finished
         finally:
             left.set()

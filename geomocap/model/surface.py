@@ -128,11 +128,11 @@ def plane_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:
     near : (M, k) int
         Points of each plane.
     """
-    return np.linalg.eigh(scatter(np.ascontiguousarray(points, float), near))[1][:, :, 0]
+    return np.linalg.eigh(_scatter(np.ascontiguousarray(points, float), near))[1][:, :, 0]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def scatter(points, near):
+def _scatter(points, near):
     """Sums (M, 3, 3) of the squared distances from their middle, by direction, of some of N points (N, 3) each.
 
     Parameters

@@ -16,9 +16,9 @@ from geomocap.subject.model_building import BodyCloud, build_model
 from geomocap.subject.model_following import fit_motion
 from geomocap.subject.subject_model import SubjectModel
 
-# Power of what the paths miss, beside what the model's drawn surface misses of the silhouettes. Of the two results for
-# each of fourteen captures the better was taken with any power from 0.15 to 0.48 in twelve, with 0.5 in eleven, with 0
-# in eight; in one of the others neither was better.
+# Power of what the paths miss, beside what the model's drawn surface misses of the silhouettes. Of two results each of
+# fourteen sets of paths, of thirteen captures, the better was taken with any power from 0.15 to 0.48 in twelve, with
+# 0.5 in eleven, with 0 in nine; in one of the others neither was better. All had been looked at before it was set.
 _PATHS = 0.3
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.nodes.anchors import Anchors
 from geomocap.nodes.correspondences import Target
+from geomocap.nodes.image_motion import ImageMotion
 from geomocap.nodes.image_pull import HALF, FrameImages, window_pulls
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.nodes.node_tracking import NodeModel, track_nodes
@@ -208,6 +210,16 @@ def even(frame: int) -> FrameImages:
             voxel_size=0.01,
         )
     )
+
+
+def test_fewer_nodes_than_the_smallest_limb_are_none():
+    spacing, rest = 0.5, np.zeros((300, 3))
+    motion = SimpleNamespace(graph=SimpleNamespace(spacing=spacing))
+    for count in (2, 3, 40):  # of 300; a hundredth is 3
+        moved = rest.copy()
+        moved[:count, 1] = 2.1 * spacing
+        apart = ImageMotion._apart(motion, (rest, None), (moved, None))
+        assert np.flatnonzero(apart).tolist() == list(range(count) if count >= 3 else [])
 
 
 def test_a_lost_limb_is_found_again_and_followed_back():

@@ -5,7 +5,6 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from geomocap import motion
 from geomocap.bodies import body_elimination
 from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.bodies.motion_bodies import find_motion_bodies
@@ -16,6 +15,7 @@ from geomocap.bodies.surface_noise import ring_misses, surface_noise
 from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.rotations import turn_angles
+from geomocap.motion import unsure_turns
 from geomocap.skeleton.bone_motion import forward_kinematics
 from geomocap.skeleton.borders import Border
 from geomocap.skeleton.common_points import common_point
@@ -55,53 +55,6 @@ def test_result_is_the_same_bit_for_bit(three, found):
     again = find_motion_bodies(MotionPaths(three.positions))
     np.testing.assert_array_equal(again.label, found.label)
     np.testing.assert_array_equal(again.rotations, found.rotations)
-
-
-def split(bodies, wobble_deg):
-    """Bodies of which half of the first is another one, whose motion wobbles."""
-    half = (bodies.label == 0) & (bodies.rest[:, 0] > np.median(bodies.rest[bodies.label == 0, 0]))
-    weights = np.pad(bodies.weights, ((0, 0), (0, 1)))
-    weights[half] = np.eye(bodies.body_count + 1)[-1]
-    angles = wobble_deg * np.sin(np.arange(len(bodies.rotations)))[:, None]
-    wobble = Rotation.from_euler("z", angles, degrees=True).as_matrix()
-    turned = wobble @ bodies.rotations[:, 0]
-    middle = bodies.rest[half].mean(axis=0)
-    shift = bodies.rotations[:, 0] @ middle + bodies.translations[:, 0] - turned @ middle
-    return replace(
-        bodies,
-        label=np.where(half, bodies.body_count, bodies.label).astype(np.int32),
-        weights=weights,
-        rotations=np.concatenate([bodies.rotations, turned[:, None]], axis=1),
-        translations=np.concatenate([bodies.translations, shift[:, None]], axis=1),
-        reliability=np.pad(bodies.reliability, ((0, 0), (0, 1)), constant_values=0.5),
-        confidence=np.append(bodies.confidence, 0.55),
-    )
-
-
-def test_bodies_that_turn_alike_once_refined_are_one(three, found, monkeypatch):
-    paths = MotionPaths(three.positions)
-    torn = split(found, wobble_deg=17.0)
-    monkeypatch.setattr(motion, "find_bodies_and_depths", lambda *_: (torn, paths))
-    joined = motion.find_motion(paths, fps=30)
-    assert joined.body_count == 3
-    assert same_partition(joined.labels, three.body) > 0.97
-    as_asked = motion.find_motion(paths, fps=30, bodies=4)
-    assert as_asked.body_count == 4
-
-
-def test_a_body_takes_the_samples_of_another(found):
-    torn = split(found, wobble_deg=17.0)
-    joined = torn.merged(0, 3)
-    np.testing.assert_array_equal(joined.label, found.label)
-    np.testing.assert_array_equal(joined.rotations, found.rotations)
-    np.testing.assert_allclose(joined.weights.sum(axis=1), 1.0)
-    sizes = np.bincount(torn.label)
-    expected = (sizes[0] * torn.reliability[:, 0] + sizes[3] * torn.reliability[:, 3]) / (sizes[0] + sizes[3])
-    np.testing.assert_allclose(joined.reliability[:, 0], expected)
-    assert joined.confidence[0] == torn.confidence[[0, 3]].max()
-    other_way = torn.merged(3, 0)  # later numbers move up
-    assert same_partition(other_way.label, found.label) == 1.0
-    np.testing.assert_array_equal(other_way.rotations[:, 2], torn.rotations[:, 3])
 
 
 def test_turns_that_are_known_still_are_those_found_anew(three, monkeypatch):
@@ -146,9 +99,9 @@ def test_bodies_are_not_split_where_turns_are_unsure(three, seed):
 
 
 def test_turns_of_noise_are_called_unsure(three, found):
-    assert motion.unsure_turns(found) == ()
+    assert unsure_turns(found) == ()
     noise = np.random.default_rng(0).normal(0, 0.2, three.positions.shape)  # metres, of boxes 0.12 m wide
-    (warning,) = motion.unsure_turns(find_motion_bodies(MotionPaths(three.positions + noise)))
+    (warning,) = unsure_turns(find_motion_bodies(MotionPaths(three.positions + noise)))
     assert "not to be trusted" in warning and "more cameras" in warning
 
 

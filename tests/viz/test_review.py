@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shutil
 from pathlib import Path
-from threading import Event, Timer
 
 import av
 import numpy as np
@@ -21,9 +20,8 @@ from geomocap.files.frame_files import ply_count, read_points
 from geomocap.files.run import Run
 from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.rotations import rotation_vectors
-from geomocap.progress import Progress
 from tests.viz.conftest import LIMBS, Made
-from viz import films, render_file, review, scene
+from viz import render_file, review, scene
 from viz.camera_pictures import frusta
 from viz.drawing import write_png
 from viz.figures import joint_angles
@@ -96,29 +94,6 @@ def test_pictures_repeat_to_the_bit(made: Made, reviewed: list[Path], tmp_path: 
     assert (tmp_path / "paths.png").read_bytes() == (made.run.path / "review" / "paths.png").read_bytes()
     assert results.skeleton is not None
     assert joint_angles(results.skeleton, 30.0) == (made.run.path / "review" / "joint_angles.png").read_bytes()
-
-
-def test_a_film_is_given_up_with_the_review_that_it_is_made_beside(
-    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    results = Results(made.run, made.capture)
-    place = stage(results)
-    drawn = []
-
-    def draw(*_: object, progress: Progress, **__: object) -> None:
-        for k in range(100):
-            progress("video", k, 100)
-            drawn.append(k)
-            started.set()
-            gone.wait(60)
-
-    started, gone = Event(), Event()
-    monkeypatch.setattr(films, "motion_video", draw)
-    with pytest.raises(ValueError), films.filmed_beside(results, place, tmp_path / "motion.mp4"):
-        assert started.wait(60)
-        Timer(0.2, gone.set).start()
-        raise ValueError
-    assert drawn == [0]
 
 
 def test_a_quick_report_shows_two_frames_and_the_same_film(made: Made, reviewed: list[Path], tmp_path: Path) -> None:
