@@ -4,8 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
+from scipy.spatial import cKDTree
 
+from geomocap.model.motion_paths import MotionPaths
 from geomocap.nodes.node_graph import NodeGraph
+
+# Standard deviation of a coordinate, fraction of the distance from the nearest anchor. Against the truth, before eight
+# cameras and from 0.5 to 20 % of the diagonal away, medians of the error's length were 2 to 10 % of the distance on a
+# horse and a walking dwarf, 35 to 60 % on a spinning one; one node in ten errs three to eleven times as much. Bodies of
+# five such captures came out alike with 0.1 and 0.3; with 0.04 there were more of them that aren't.
+_SWAY = 0.1
 
 
 def patch_mean(graph: NodeGraph, rounds: int = 2) -> csr_matrix:
@@ -62,3 +70,27 @@ def node_covariance(
     if anchored is not None:
         information += (mean @ anchored / variance)[:, None, None] * np.eye(3)
     return np.linalg.inv(information), support
+
+
+def carried_sigma(nodes: np.ndarray, anchors: MotionPaths) -> np.ndarray:
+    """Standard deviation of nodes that anchors hold, frame by frame, (N, T) float, metres; NaN without anchors.
+
+    What is carried along by the surface between it and the nearest anchor errs by that one's noise and by a turn that
+    nobody measured, the more so the farther it is away.
+
+    Parameters
+    ----------
+    nodes : (N, T, 3) float, metres
+        NaN where lost.
+    anchors : MotionPaths
+        With `sigma`.
+    """
+    assert anchors.sigma is not None
+    noise = np.broadcast_to(anchors.sigma.reshape(anchors.count, -1), anchors.seen.shape)
+    found = np.full(nodes.shape[:2], np.nan)
+    for k in range(nodes.shape[1]):
+        held, there = np.flatnonzero(anchors.seen[:, k]), np.flatnonzero(np.isfinite(nodes[:, k, 0]))
+        if len(held) and len(there):
+            away, nearest = cKDTree(anchors.positions[held, k]).query(nodes[there, k])
+            found[there, k] = np.hypot(noise[held[nearest], k], _SWAY * away)
+    return found

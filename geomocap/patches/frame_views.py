@@ -145,11 +145,14 @@ class FrameViews:
         _look_up(pixel, self.depth, surface)
         return depth, surface
 
-    def may_be_subject(self, points: np.ndarray) -> np.ndarray:
-        """Whether world points (N, 3) lie in the silhouettes of all cameras that see them, or close by: (N,) bool."""
+    def may_be_subject(self, points: np.ndarray, asked: np.ndarray | None = None) -> np.ndarray:
+        """Whether world points (N, 3) lie in the silhouettes of all cameras that see them, or close by: (N,) bool.
+
+        `asked` (N, C) bool: of these cameras only, if given.
+        """
         allowed = np.empty((len(points), self.count))
         _look_up(self.project(points)[0], self.allowed, allowed)
-        return (allowed != 0).all(axis=1)
+        return ((allowed != 0) | (False if asked is None else ~asked)).all(axis=1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

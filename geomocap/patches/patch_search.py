@@ -168,7 +168,9 @@ def judge(state: Followed, found: PatchAlignment, view: FrameViews, settings: Tr
     reason[found.image_sigma > settings.sigma_px * np.where(alone, _ALONE, 1.0) * size] = LOW_PRECISION
     reason[found.correlation < settings.correlation] = LOW_CORRELATION
     reason[found.n_views < _enough(state, found, settings)] = UNSEEN
-    reason[(reason == LAST_FRAME) & ~view.may_be_subject(found.positions)] = OUTSIDE
+    # a single camera's patch lies on the hull's front, which is where another silhouette ends
+    asked = ~alone[:, None] | (found.by_camera > -1)
+    reason[(reason == LAST_FRAME) & ~view.may_be_subject(found.positions, asked)] = OUTSIDE
     good = np.flatnonzero(reason == LAST_FRAME)
     near = nearest(state.patches.positions, good, good, _NEIGHBOURS)
     if near.shape[1] >= _AGREEING:

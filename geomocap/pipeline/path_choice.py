@@ -15,6 +15,7 @@ from geomocap.model.frame_geometry import Geometry
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.trajectories import Trajectories
 from geomocap.nodes.node_tracking import track_nodes
+from geomocap.nodes.node_uncertainty import carried_sigma
 from geomocap.nodes.surface_coverage import SMALLEST_PIECE, left_over, piece_reach, uncovered_fraction
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.track_stage import frame_reader
@@ -36,9 +37,9 @@ ANCHOR_FRACTION = 0.1  # those are measured in this fraction of the frames at le
 def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, MotionPaths]:
     """Motion paths by what they are; where there is a choice, bodies tell which are best.
 
-    They are "patches", "nodes", "both" (nodes held by patches and images), "pieces" (patches, and where these leave
-    pieces of the surface uncovered, those nodes there), "points" or "ellipsoids". Nodes are followed only where some
-    piece needs them; then "pieces" and "both" are returned. Where single cameras follow the surface that is where
+    They are "patches", "nodes", "both" (nodes held by patches and images), "pieces" (patches, and those nodes where
+    these leave gaps), "points" or "ellipsoids". Nodes are followed only where patches leave a piece of the surface
+    uncovered; then "pieces" and "both" are returned. Where single cameras follow the surface that is where
     these leave half of it; then "patches" and "both" are returned.
 
     Parameters
@@ -78,14 +79,15 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
             return {"patches": patches}
     anchors = None if tracked is None else _anchors(tracked)
     nodes = _follow_nodes(job, geometry, anchors)
-    # nodes that images hold are as precise as their neighbourhood shows; the geometry doesn't know it
-    held = nodes if anchors is None else replace(nodes, sigma=None)
+    # images hold nodes, which the geometry doesn't know
+    held = nodes if anchors is None else replace(nodes, sigma=carried_sigma(nodes.positions, anchors))
     if patches is None:
         return {"nodes" if tracked is None else "both": held}
     if patches.ray is not None:
         return {"patches": patches, "both": held}
-    rest = left_over(nodes.positions, patches.positions, reach)
-    return {"pieces": _joined(patches, nodes, rest), "both": held}
+    # as far from each other as paths would be, were they all over the surface
+    spacing = reach / float(np.sqrt(SMALLEST_PIECE * SAMPLES))
+    return {"pieces": _joined(patches, held, left_over(held.positions, patches.positions, spacing)), "both": held}
 
 
 def _follow_nodes(job: Job, geometry: Geometry, anchors: MotionPaths | None) -> MotionPaths:

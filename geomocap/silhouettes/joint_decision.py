@@ -143,20 +143,26 @@ def decide(
     words = others.words(voted) if others is not None else None
     masks = []
     for c, view in enumerate(views):
-        odds, vote = own[c], voted[c]
+        odds, vote, said = own[c], voted[c], None
         if words is not None:
-            bonus = np.append(0.0, likelihood.bonus[c]).astype(np.float32)[_depth(words[c], len(views))]
-            word = np.minimum(words[c], bonus)
+            said = words[c]
+            bonus = np.append(0.0, likelihood.bonus[c]).astype(np.float32)[_depth(said, len(views))]
+            word = np.minimum(said, bonus)
             odds, vote = odds + word, vote + word
-        masks.append(_finish(view, vote > 0, odds, float(likelihood.alike[c]), settings))
+        masks.append(_finish(view, vote > 0, odds, said, float(likelihood.alike[c]), settings))
     return Decision(tuple(masks), tuple(own), tuple(voted), None if words is None else tuple(words))
 
 
 def _finish(
-    view: CameraEvidence, mask: np.ndarray, odds: np.ndarray, alike: float, settings: SilhouetteSettings
+    view: CameraEvidence,
+    mask: np.ndarray,
+    odds: np.ndarray,
+    words: np.ndarray | None,
+    alike: float,
+    settings: SilhouetteSettings,
 ) -> np.ndarray:
     """Undo pieces and holes that aren't real, and take the outline to half a pixel."""
-    mask = clean(mask, odds, alike, settings.smallest)
+    mask = clean(mask, odds, alike, settings.smallest, words)
     part = bounding_slices(mask, 4)
     model = view.model
     image, mean, known, sigma = (

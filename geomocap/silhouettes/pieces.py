@@ -5,16 +5,20 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numba import njit
+from scipy.ndimage import maximum
 
 COHERENCE = 3.0  # log odds that each pixel of border between subject and background costs
 SMALLEST_RELATIVE = 0.02  # of the largest piece: smaller ones go
 
 
-def clean(mask: np.ndarray, evidence: np.ndarray, alike: float, smallest: float) -> np.ndarray:
+def clean(
+    mask: np.ndarray, evidence: np.ndarray, alike: float, smallest: float, words: np.ndarray | None = None
+) -> np.ndarray:
     """Fill enclosed holes and drop separate pieces whose evidence is weak for the length of their border.
 
     The rule of a Potts model for whole regions: a region's own evidence must pay for its border. Size thresholds for
-    pieces come on top.
+    pieces come on top. A piece of which the other cameras deny every pixel goes, however sure its own camera is:
+    something has changed where the subject can't be.
 
     Parameters
     ----------
@@ -25,6 +29,8 @@ def clean(mask: np.ndarray, evidence: np.ndarray, alike: float, smallest: float)
         How many neighbouring pixels fraction their noise: a region's evidence is worth that much less.
     smallest : float
         Smaller pieces go, fraction of the image.
+    words : (H, W) float32, optional
+        What the other cameras say, log odds.
 
     Returns
     -------
@@ -52,6 +58,8 @@ def clean(mask: np.ndarray, evidence: np.ndarray, alike: float, smallest: float)
     least = max(smallest * mask.size, SMALLEST_RELATIVE * float(areas[1:].max(initial=0)))
     keep = (areas >= least) & (total > cost * border)
     keep[0] = False
+    if words is not None:
+        keep[1:] &= maximum(words[part], labels, np.arange(1, count)) >= 0.0
     result = np.zeros_like(mask)
     result[part] = keep[labels]
     return result

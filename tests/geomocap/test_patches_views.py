@@ -40,6 +40,12 @@ def test_frame_views_have_depth_in_front_of_the_surface_and_no_background(scene,
 def test_points_outside_a_silhouette_are_not_the_subject(views):
     points = np.array([[0.0, 0, 0], [0.19, 0, 0], [0.3, 0, 0], [0, 0, -50.0]])
     assert views[0].may_be_subject(points).tolist() == [True, True, False, True]  # the last one nobody sees
+    asked = np.zeros((len(points), views[0].count), bool)
+    assert views[0].may_be_subject(points, asked).all()
+    asked[1:3, 0] = True  # camera 0 looks along the axis on which these lie
+    assert views[0].may_be_subject(points, asked).tolist() == [True] * 4
+    asked[1:3] = True
+    assert views[0].may_be_subject(points, asked).tolist() == [True, True, False, True]
 
 
 def test_an_empty_silhouette_allows_all_points(scene):

@@ -18,6 +18,7 @@ from geomocap.silhouettes.colors import LEVEL, LEVELS, color_density, count_colo
 from geomocap.silhouettes.joint_decision import CameraEvidence, Decision, decide, learn_from
 from geomocap.silhouettes.likelihood import BINS, CLASSES, QUARTERS, Likelihood, log_odds, misfit_density, shared_noise
 from geomocap.silhouettes.other_cameras import NOWHERE, STEPS, OtherCameras, best_on_rays, gather, say
+from geomocap.silhouettes.pieces import clean
 from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 SETTINGS = SilhouetteSettings()
@@ -325,3 +326,17 @@ def _best_on_ray(origin: np.ndarray, ray: np.ndarray, word: np.ndarray, low: np.
         if best >= enough:
             break
     return best / STEPS
+
+
+def test_a_piece_that_the_others_deny_everywhere_goes() -> None:
+    """One other camera that sees the place is too little against each pixel, but not against all of a piece."""
+    mask = np.zeros((60, 80), bool)
+    mask[10:50, 10:30] = mask[20:40, 50:70] = True
+    odds = np.where(mask, 6.0, -6.0).astype(np.float32)
+    words = np.full(mask.shape, -3.5, np.float32)
+    words[15:45, 12:28] = 2.0  # the rim of the subject isn't confirmed, but hangs together with what is
+    alone, together = (clean(mask, odds, 1.0, 1e-4, said) for said in (None, words))
+    np.testing.assert_array_equal(alone, mask)
+    assert together[10:50, 10:30].all() and together.sum() == 40 * 20
+    words[25:30, 55:60] = 0.0  # nobody else sees this
+    np.testing.assert_array_equal(clean(mask, odds, 1.0, 1e-4, words), mask)
