@@ -11,7 +11,8 @@ from geomocap.bodies.rigid_motions import _step_equations, fit_rigid_motion
 from geomocap.bodies.skin_blending import explain
 from geomocap.bodies.surface_graph import bridges, lasting_distances, surface_graph
 from geomocap.model.motion_paths import DEPTH_FRACTION, sure_part
-from geomocap.model.rotations import turn_angles
+from geomocap.model.rotations import rigid_motion, turn_angles
+from geomocap.scheduling import limit_threads
 
 
 def test_lasting_distances_are_the_third_largest():
@@ -82,6 +83,78 @@ def test_rigid_motion_is_steady_against_samples_that_do_not_follow():
     assert np.rad2deg(turn_angles(rotations.swapaxes(1, 2) @ true)).max() < 0.05
     assert np.abs(translations - 1.0).max() < 1e-3
     assert residuals[:8].min() > residuals[8:].max()
+
+
+def fitted_with_numpy(positions, rest, weights, least_scale, rounds=5, ray=None):
+    """What `fit_rigid_motion` returns, written with whole arrays."""
+    given, start = np.maximum(weights, 1e-9), 0 if ray is None else 3
+    robust = given
+    for k in range(start + rounds):
+        if ray is None or k < start:
+            R, t = rigid_motion(rest, positions.swapaxes(0, 1), robust.T, prior=1e-12 * np.eye(3))
+        else:
+            turned = np.einsum("tij,nj->nti", R, rest)
+            middle = (robust[..., None] * turned).sum(axis=0) / robust.sum(axis=0)[:, None]
+            x, y, z = np.moveaxis(turned - middle, 2, 0)
+            o = np.zeros_like(x)
+            arms = np.stack([np.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], -2)
+            J = np.concatenate([-arms, np.broadcast_to(np.eye(3), arms.shape)], axis=-1)
+            across = robust[..., None, None] * (
+                np.eye(3) - (1 - DEPTH_FRACTION**2) * ray[..., :, None] * ray[..., None, :]
+            )
+            normal = np.einsum("ntki,ntkl,ntlj->tij", J, across, J)
+            right = np.einsum("ntki,ntkl,ntl->ti", J, across, positions - turned - t)
+            normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(6)
+            step = np.linalg.solve(normal, right[..., None])[..., 0]
+            turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
+            R, t = turn @ R, t + step[:, 3:] + middle - np.einsum("tij,tj->ti", turn, middle)
+        miss = np.linalg.norm(sure_part(np.einsum("tij,nj->nti", R, rest) + t - positions, ray), axis=2)
+        residuals = np.sqrt((given * miss**2).sum(axis=1) / given.sum(axis=1))
+        scale = 2 * max(np.median(residuals), least_scale)
+        robust = given / (1 + (residuals / scale) ** 4)[:, None] / (1 + (miss / (2 * scale)) ** 4)
+    return R, t, residuals
+
+
+def loose_body(count: int, frames: int) -> tuple[np.ndarray, ...]:
+    """A moving body of which some samples go astray, some are not seen, and most have rays."""
+    rng = np.random.default_rng(13)
+    rest = rng.normal(scale=0.1, size=(count, 3)) + [1.0, 2.0, 0.5]
+    true = Rotation.from_rotvec(rng.normal(scale=0.5, size=(frames, 3))).as_matrix()
+    positions = np.einsum("tij,nj->nti", true, rest) + rng.normal(scale=2e-3, size=(count, frames, 3))
+    positions[: count // 6] += rng.normal(scale=0.05, size=(count // 6, frames, 3))
+    weights = rng.random((count, frames)) * (rng.random((count, frames)) > 0.1)
+    ray = rng.normal(size=(count, frames, 3)) * (rng.random((count, frames, 1)) > 0.3)
+    return positions, rest, weights, ray / np.maximum(np.linalg.norm(ray, axis=2, keepdims=True), 1e-12)
+
+
+@pytest.mark.parametrize("rays", [False, True])
+def test_a_rigid_motion_is_that_of_whole_arrays(rays):
+    positions, rest, weights, ray = loose_body(40, 12)
+    ray = ray if rays else None
+    found = fit_rigid_motion(positions, rest, weights, 1e-4, ray=ray)
+    for one, other in zip(found, fitted_with_numpy(positions, rest, weights, 1e-4, ray=ray), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("rays", [False, True])
+def test_a_rigid_motion_is_the_same_for_any_number_of_threads(rays):
+    positions, rest, weights, ray = loose_body(210, 101)  # enough for other threads
+    found = []
+    for count in (1, None):
+        limit_threads(count)
+        found.append(fit_rigid_motion(positions, rest, weights, 1e-4, ray=ray if rays else None))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_motion_that_few_samples_leave_open_is_the_one_without_turn(count):
+    rest = np.array([[0.1, 0.2, 0.3], [0.1, 0.2, 0.4]])[:count]
+    positions = np.repeat(rest[:, None], 3, axis=1) + np.arange(3.0)[:, None]
+    rotations, translations, residuals = fit_rigid_motion(positions, rest, np.ones((count, 3)), 0.0)
+    np.testing.assert_allclose(rotations, np.tile(np.eye(3), (3, 1, 1)), atol=1e-3)
+    np.testing.assert_allclose(rest @ rotations.swapaxes(1, 2) + translations[:, None], positions.swapaxes(0, 1))
+    assert residuals.max() < 1e-12
 
 
 def seen_by_single_cameras(noise_along: float) -> tuple[np.ndarray, ...]:
