@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 from geomocap.bodies.connected_linkage import connected_linkage
 from geomocap.bodies.local_rotations import local_rotations, turn_distances
 from geomocap.bodies.rigid_motions import _step_equations, fit_rigid_motion
-from geomocap.bodies.skin_blending import explain
+from geomocap.bodies.skin_blending import blend_spans, explain, places_at_rest
 from geomocap.bodies.surface_graph import bridges, lasting_distances, surface_graph
-from geomocap.model.motion_paths import DEPTH_FRACTION, sure_part
+from geomocap.model.motion_paths import DEPTH_FRACTION, sure_part, within_ray
 from geomocap.model.rotations import rigid_motion, turn_angles
 from geomocap.scheduling import limit_threads
 
@@ -118,7 +118,7 @@ def fitted_with_numpy(positions, rest, weights, least_scale, rounds=5, ray=None)
 def loose_body(count: int, frames: int) -> tuple[np.ndarray, ...]:
     """A moving body of which some samples go astray, some are not seen, and most have rays."""
     rng = np.random.default_rng(13)
-    rest = rng.normal(scale=0.1, size=(count, 3)) + [1.0, 2.0, 0.5]
+    rest = rng.normal(scale=0.1, size=(count, 3)) + 1.0
     true = Rotation.from_rotvec(rng.normal(scale=0.5, size=(frames, 3))).as_matrix()
     positions = np.einsum("tij,nj->nti", true, rest) + rng.normal(scale=2e-3, size=(count, frames, 3))
     positions[: count // 6] += rng.normal(scale=0.05, size=(count // 6, frames, 3))
@@ -166,6 +166,42 @@ def seen_by_single_cameras(noise_along: float) -> tuple[np.ndarray, ...]:
     ray = np.repeat(np.eye(3)[np.arange(60) % 3][:, None], 6, axis=1)
     off = rng.normal(scale=noise_along, size=(60, 6, 1)) * ray + rng.normal(scale=1e-3, size=(60, 6, 3))
     return rest, true, positions + off, ray
+
+
+@pytest.mark.parametrize("rays", [False, True])
+def test_places_at_rest_are_the_least_squares_ones(rays):
+    positions, _, weights, ray = loose_body(12, 8)
+    weights[3] = 0.0
+    rng = np.random.default_rng(14)
+    rotations = Rotation.from_rotvec(rng.normal(size=(16, 3))).as_matrix().reshape(2, 8, 3, 3)
+    translations, label, samples = rng.normal(size=(2, 8, 3)), np.arange(12) % 2, np.array([1, 3, 4, 9])
+    ray = ray if rays else None
+    found = places_at_rest(samples, label, positions, weights, ray, rotations, translations)
+    for place, i in zip(found, samples, strict=True):
+        R, t, w = rotations[label[i]], translations[label[i]], weights[i]
+        if not w.any():
+            np.testing.assert_array_equal(place, 0.0)
+            continue
+        direction = np.zeros((8, 3)) if ray is None else ray[i]
+        seen = within_ray(positions[i], t, direction)
+        across = np.eye(3) - (1 - DEPTH_FRACTION**2) * direction[:, :, None] * direction[:, None, :]
+        normal = np.einsum("t,tki,tkl,tlj->ij", w, R, across, R)
+        expected = np.linalg.solve(normal, np.einsum("t,tki,tk->i", w, R, seen - t))
+        np.testing.assert_allclose(place, expected, rtol=1e-9)
+
+
+def test_spans_of_blends_are_variances_of_what_is_between_the_bodies():
+    rng = np.random.default_rng(15)
+    rotations = Rotation.from_rotvec(rng.normal(size=(18, 3))).as_matrix().reshape(3, 6, 3, 3)
+    translations, rest, weights = rng.normal(size=(3, 6, 3)), rng.normal(size=(4, 3)), rng.random((4, 6))
+    main, partner = np.array([0, 1, 2, 1]), np.array([1, -1, 0, 2])
+    carried = np.einsum("btij,nj->bnti", rotations, rest) + translations[:, None]
+    found = blend_spans(main, partner, weights, rest, rotations, translations)
+    for n in range(4):
+        apart = carried[main[n], n] - carried[partner[n], n]
+        middle = np.average(apart, axis=0, weights=weights[n])
+        expected = np.average(((apart - middle) ** 2).sum(axis=1), weights=weights[n]) if partner[n] >= 0 else 0.0
+        np.testing.assert_allclose(found[n], expected, rtol=1e-9)
 
 
 def test_what_is_unsure_along_the_ray_does_not_turn_a_body():
