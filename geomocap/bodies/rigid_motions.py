@@ -8,15 +8,15 @@ import numpy as np
 from numba import njit
 
 from geomocap.model.motion_paths import DEPTH_FRACTION
-from geomocap.model.rotations import nearest_rotation, turn_angles
-from geomocap.model.small_systems import cholesky, solve
+from geomocap.model.rotations import turn_angles
+from geomocap.model.small_systems import cholesky, nearest_turn, solve
 from geomocap.scheduling import spread
 
 _ROUNDS = 5
 _DAMPING = 1e-9
 _LEAST_WEIGHT = 1e-9
 _LEAST_SCALE = 1e-12  # metres; residuals of motions that are exact are 0
-_STILL = 1e-12 * np.eye(3)  # square metres: a group of one place doesn't turn
+_STILL = 1e-12  # square metres: a group of one place doesn't turn
 FEW_POSITIONS = 20_000  # that are not worth waking other threads for
 _START_ROUNDS = 3  # with all directions alike, before rays are told apart
 
@@ -63,13 +63,11 @@ def fit_rigid_motion(
     given = np.ascontiguousarray(np.maximum(weights, _LEAST_WEIGHT), np.float64)
     robust, squares, residuals = given.copy(), np.empty((count, frames)), np.empty(count)
     equations = np.empty((frames, 3)), np.empty((frames, 6, 6)), np.empty((frames, 6))
-    start, goal, moment = np.empty((frames, 3)), np.empty((frames, 3)), np.empty((frames, 3, 3))
+    rotations, translations = np.empty((frames, 3, 3)), np.empty((frames, 3))
     few = count + frames if weights.size < FEW_POSITIONS else 1
     for k in range(rounds if not ray.size else _START_ROUNDS + rounds):
         if not ray.size or k < _START_ROUNDS:
-            spread(_moments, frames, positions, rest, robust, start, goal, moment, few=few)
-            rotations = nearest_rotation(moment + _STILL)
-            translations = goal - (rotations @ start[..., None])[..., 0]
+            spread(_motions, frames, positions, rest, robust, rotations, translations, few=few)
         else:
             spread(_step, frames, rotations, translations, positions, rest, robust, ray, *equations, few=few)
         spread(_misses, count, rotations, translations, positions, rest, given, ray, squares, residuals, few=few)
@@ -81,22 +79,14 @@ def fit_rigid_motion(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _moments(begin, end, positions, rest, weights, start, goal, moment):
-    """Weighted means of places at rest and of positions, and their mixed second moments, as of `rigid_motion`.
+def _motions(begin, end, positions, rest, weights, rotations, translations):
+    """Motions in frames `begin` to `end` as `rigid_motion` finds them, with `_STILL`; they are filled.
 
     Sums are of what is away from the first sample, which loses less to rounding.
-
-    Parameters
-    ----------
-    begin, end : int
-        Frames to work on.
-    positions, rest, weights : (n, T, 3), (n, 3), (n, T) float
-    start, goal : (T, 3) float
-        Filled: means of places at rest and of positions.
-    moment : (T, 3, 3) float
-        Filled: position times place at rest.
     """
-    total, a = np.zeros(len(start)), np.empty(3)
+    frames = len(rotations)
+    start, goal, moment = np.empty((frames, 3)), np.empty((frames, 3)), np.empty((frames, 3, 3))
+    total, a = np.zeros(frames), np.empty(3)
     start[begin:end] = 0.0
     goal[begin:end] = 0.0
     moment[begin:end] = 0.0
@@ -118,9 +108,12 @@ def _moments(begin, end, positions, rest, weights, start, goal, moment):
         for i in range(3):
             for j in range(3):
                 moment[t, i, j] = (moment[t, i, j] - goal[t, i] * start[t, j] / total[t]) / total[t]
+            moment[t, i, i] += _STILL
+        nearest_turn(moment[t], rotations[t])
         for i in range(3):
-            start[t, i] = rest[0, i] + start[t, i] / total[t]
-            goal[t, i] = positions[0, t, i] + goal[t, i] / total[t]
+            translations[t, i] = positions[0, t, i] + goal[t, i] / total[t]
+            for j in range(3):
+                translations[t, i] -= rotations[t, i, j] * (rest[0, j] + start[t, j] / total[t])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -11,7 +11,8 @@ from geomocap.bodies.rigid_motions import _step_equations, fit_rigid_motion
 from geomocap.bodies.skin_blending import blend_spans, explain, places_at_rest
 from geomocap.bodies.surface_graph import bridges, lasting_distances, surface_graph
 from geomocap.model.motion_paths import DEPTH_FRACTION, sure_part, within_ray
-from geomocap.model.rotations import rigid_motion, turn_angles
+from geomocap.model.rotations import nearest_rotation, rigid_motion, turn_angles
+from geomocap.model.small_systems import nearest_turn
 from geomocap.scheduling import limit_threads
 
 
@@ -83,6 +84,20 @@ def test_rigid_motion_is_steady_against_samples_that_do_not_follow():
     assert np.rad2deg(turn_angles(rotations.swapaxes(1, 2) @ true)).max() < 0.05
     assert np.abs(translations - 1.0).max() < 1e-3
     assert residuals[:8].min() > residuals[8:].max()
+
+
+def test_nearest_turns_are_those_by_singular_values():
+    rng = np.random.default_rng(16)
+    matrices = rng.normal(size=(60, 3, 3))
+    matrices[::3, :, 2] = 0.0  # flat
+    matrices[1::3] *= 1e-8
+    found = np.empty_like(matrices)
+    for M, R in zip(matrices, found, strict=True):
+        nearest_turn(M, R)
+    np.testing.assert_allclose(found, nearest_rotation(matrices), atol=1e-11)
+    for M in (np.zeros((3, 3)), np.diag([0.0, 2.0, 0.0])):
+        nearest_turn(M, found[0])
+        np.testing.assert_array_equal(found[0], np.eye(3))
 
 
 def fitted_with_numpy(positions, rest, weights, least_scale, rounds=5, ray=None):
