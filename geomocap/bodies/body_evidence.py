@@ -22,8 +22,9 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from geomocap.bodies.body_model import BodyModel, Evidence, carry
+from geomocap.bodies.body_model import BodyModel, Evidence
 from geomocap.bodies.rigid_motions import relative_turn
+from geomocap.bodies.skin_blending import blend_spans
 from geomocap.bodies.surface_noise import SurfaceNoise
 
 _FREEDOMS = 3  # of a turn
@@ -196,18 +197,8 @@ def _spans(some: np.ndarray, main: np.ndarray, partner: np.ndarray, model: BodyM
 
     Frames are weighted as they are in what is missed of a sample: those in which it isn't seen don't count.
     """
-    result = np.zeros(len(some))
-    for a, b in np.unique(np.stack([main, partner], axis=1), axis=0):
-        if b < 0:
-            continue
-        which = np.flatnonzero((main == a) & (partner == b))
-        rest = evidence.rest[some[which]]
-        apart = carry(model.rotations[a] - model.rotations[b], model.translations[a] - model.translations[b], rest)
-        fraction = evidence.weights[some[which]]
-        fraction = (fraction / np.maximum(fraction.sum(axis=1, keepdims=True), 1e-12))[..., None]
-        middle = (fraction * apart).sum(axis=1, keepdims=True)
-        result[which] = (fraction * (apart - middle) ** 2).sum(axis=(1, 2))
-    return result
+    weights, rest = evidence.weights[some], evidence.rest[some]
+    return blend_spans(main, partner, weights, rest, model.rotations, model.translations)
 
 
 def _square_radius(places: np.ndarray) -> float:

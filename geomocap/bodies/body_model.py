@@ -9,8 +9,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from geomocap.bodies.rigid_motions import fit_rigid_motion
-from geomocap.bodies.skin_blending import Blends, explain
-from geomocap.model.motion_paths import DEPTH_FRACTION, within_ray
+from geomocap.bodies.skin_blending import Blends, explain, places_at_rest
 
 _LEAST_CONTACTS = 3
 _LEAST_FRACTION = 0.3
@@ -225,19 +224,15 @@ def settle_rest(model: BodyModel, evidence: Evidence) -> Evidence:
     if not len(open_places):
         return evidence
     rest = evidence.rest.copy()
-    for b in np.unique(model.label[open_places]):
-        some = open_places[model.label[open_places] == b]
-        away = evidence.positions[some] - model.translations[b]
-        fraction = evidence.weights[some] / np.maximum(evidence.weights[some].sum(axis=1, keepdims=True), 1e-12)
-        if evidence.ray is None:
-            rest[some] = (fraction[:, :, None] * (away[:, :, None] @ model.rotations[b])[:, :, 0]).sum(axis=1)
-            continue
-        ray = evidence.ray[some]
-        away = within_ray(away, np.zeros(3), ray)
-        direction = (ray[:, :, None] @ model.rotations[b])[:, :, 0]
-        normal = np.eye(3) - (1.0 - DEPTH_FRACTION**2) * np.einsum("nt,nti,ntj->nij", fraction, direction, direction)
-        right = (fraction[:, :, None] * (away[:, :, None] @ model.rotations[b])[:, :, 0]).sum(axis=1)
-        rest[some] = np.linalg.solve(normal, right[..., None])[..., 0]
+    rest[open_places] = places_at_rest(
+        open_places,
+        model.label,
+        evidence.positions,
+        evidence.weights,
+        evidence.ray,
+        model.rotations,
+        model.translations,
+    )
     return replace(evidence, rest=rest)
 
 

@@ -64,6 +64,79 @@ def _place_at_rest(positions, weights, total, ray, rotations, translations, plac
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _places_at_rest(begin, end, samples, label, positions, weights, ray, rotations, translations, places):
+    for k in range(begin, end):
+        i, b = samples[k], label[samples[k]]
+        total = weights[i].sum()
+        if total > 1e-12:
+            _place_at_rest(positions[i], weights[i], total, ray[i], rotations[b], translations[b], places[k])
+
+
+def places_at_rest(
+    samples: np.ndarray,
+    label: np.ndarray,
+    positions: np.ndarray,
+    weights: np.ndarray,
+    ray: np.ndarray | None,
+    rotations: np.ndarray,
+    translations: np.ndarray,
+) -> np.ndarray:
+    """Places that the motion of each sample's body carries best to its positions, least squares over the frames.
+
+    Parameters
+    ----------
+    samples : (n,) int
+        Those of the N that are asked for.
+    label : (N,) int
+        Bodies.
+    positions, weights, ray, rotations, translations
+        See `explain`.
+
+    Returns
+    -------
+    (n, 3) float, metres
+        0 where all weights are.
+    """
+    places = np.zeros((len(samples), 3))
+    arrays = _arrays(positions, weights, ray, rotations, translations)
+    few = len(samples) if len(samples) * weights.shape[1] < FEW_POSITIONS else 1
+    spread(_places_at_rest, len(samples), samples, label, *arrays, places, few=few)
+    return places
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def blend_spans(main, partner, weights, rest, rotations, translations):
+    """Mean square by which the two bodies of their blends carry samples apart, (n,), metres²; 0 without a second.
+
+    Parameters
+    ----------
+    main, partner : (n,) int
+        Bodies; a partner below 0: none.
+    weights : (n, T) float
+    rest : (n, 3) float, metres
+    rotations, translations : (B, T, 3, 3), (B, T, 3) float
+    """
+    count, frames = weights.shape
+    result, apart = np.zeros(count), np.empty((frames, 3))
+    for n in range(count):
+        a, b = main[n], partner[n]
+        if b < 0:
+            continue
+        total = max(weights[n].sum(), 1e-12)
+        middle = np.zeros(3)
+        for t in range(frames):
+            for i in range(3):
+                apart[t, i] = translations[a, t, i] - translations[b, t, i]
+                for j in range(3):
+                    apart[t, i] += (rotations[a, t, i, j] - rotations[b, t, i, j]) * rest[n, j]
+                middle[i] += weights[n, t] / total * apart[t, i]
+        for t in range(frames):
+            for i in range(3):
+                result[n] += weights[n, t] / total * (apart[t, i] - middle[i]) ** 2
+    return result
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _explain_one(
     i,
     positions,
@@ -224,18 +297,19 @@ def explain(
     cap : float, metres
         Larger residuals of single frames count as this.
     """
+    positions, weights, ray, rotations, translations = _arrays(positions, weights, ray, rotations, translations)
     shape = (len(weights), len(rotations))
     blends = Blends(np.full(shape, np.inf), np.full(shape, -1, np.int32), np.ones(shape))
     spread(
         _explain,
         len(weights),
-        np.ascontiguousarray(positions),
+        positions,
         weights,
-        np.zeros((len(weights), 0, 3)) if ray is None else np.ascontiguousarray(ray, float),
+        ray,
         rest,
         certain,
-        np.ascontiguousarray(rotations),
-        np.ascontiguousarray(translations),
+        rotations,
+        translations,
         allowed,
         adjacent,
         penalty**2,
@@ -246,3 +320,14 @@ def explain(
         few=len(weights) if weights.size < FEW_POSITIONS else 1,
     )
     return blends
+
+
+def _arrays(
+    positions: np.ndarray, weights: np.ndarray, ray: np.ndarray | None, rotations: np.ndarray, translations: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """The same as kernels take them; (N, 0, 3): no rays."""
+    ray = np.zeros((len(weights), 0, 3)) if ray is None else ray
+    positions, ray, rotations, translations = (
+        np.ascontiguousarray(a, float) for a in (positions, ray, rotations, translations)
+    )
+    return positions, weights, ray, rotations, translations

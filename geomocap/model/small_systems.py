@@ -1,4 +1,4 @@
-"""Small symmetric systems of equations inside kernels: Cholesky's factors of 6 × 6 matrices, 3 × 3 by cofactors."""
+"""Small matrices inside kernels: Cholesky's factors of symmetric 6 × 6 ones, 3 × 3 systems, nearest rotations."""
 
 from __future__ import annotations
 
@@ -70,3 +70,57 @@ def solve_symmetric(N, b, x):
     determinant = N[0, 0] * xx + N[0, 1] * xy + N[0, 2] * xz
     u, v, w = b[0] / determinant, b[1] / determinant, b[2] / determinant
     x[0], x[1], x[2] = xx * u + xy * v + xz * w, xy * u + yy * v + yz * w, xz * u + yz * v + zz * w
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def nearest_turn(M, R):
+    """Proper rotation that maximises trace(Rᵀ M), into R (3, 3), by one-sided Jacobi rotations (Hestenes 1958).
+
+    For single matrices what `rotations.nearest_rotation` is for many; the identity if M has rank 0 or just 1.
+    """
+    U, V = M.copy(), np.eye(3)
+    lengths = np.empty(3)
+    for _ in range(30):  # 4 to 6 are enough
+        done = True
+        for p, q in ((0, 1), (0, 2), (1, 2)):
+            first, second, both = 0.0, 0.0, 0.0
+            for i in range(3):
+                first += U[i, p] * U[i, p]
+                second += U[i, q] * U[i, q]
+                both += U[i, p] * U[i, q]
+            if abs(both) <= 1e-15 * math.sqrt(first * second):
+                continue
+            done = False
+            ratio = (second - first) / (2.0 * both)
+            tangent = math.copysign(1.0, ratio) / (abs(ratio) + math.sqrt(1.0 + ratio * ratio))
+            c = 1.0 / math.sqrt(1.0 + tangent * tangent)
+            s = c * tangent
+            for i in range(3):
+                U[i, p], U[i, q] = c * U[i, p] - s * U[i, q], s * U[i, p] + c * U[i, q]
+                V[i, p], V[i, q] = c * V[i, p] - s * V[i, q], s * V[i, p] + c * V[i, q]
+        if done:
+            break
+    for j in range(3):
+        lengths[j] = U[0, j] * U[0, j] + U[1, j] * U[1, j] + U[2, j] * U[2, j]
+    order = np.argsort(-lengths)
+    u, v = np.empty((3, 3)), np.empty((3, 3))
+    for k in range(2):
+        for i in range(3):
+            u[k, i], v[k, i] = U[i, order[k]], V[i, order[k]]
+        if k:
+            along = u[0, 0] * u[1, 0] + u[0, 1] * u[1, 1] + u[0, 2] * u[1, 2]
+            for i in range(3):
+                u[1, i] -= along * u[0, i]
+        length = math.sqrt(u[k, 0] * u[k, 0] + u[k, 1] * u[k, 1] + u[k, 2] * u[k, 2])
+        if length == 0.0:
+            R[:] = np.eye(3)
+            return
+        for i in range(3):
+            u[k, i] /= length
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        u[2, i] = u[0, j] * u[1, k] - u[0, k] * u[1, j]
+        v[2, i] = v[0, j] * v[1, k] - v[0, k] * v[1, j]
+    for i in range(3):
+        for j in range(3):
+            R[i, j] = u[0, i] * v[0, j] + u[1, i] * v[1, j] + u[2, i] * v[2, j]

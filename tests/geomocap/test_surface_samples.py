@@ -8,10 +8,12 @@ from scipy.spatial.transform import Rotation
 from geomocap.bodies.connected_linkage import connected_linkage
 from geomocap.bodies.local_rotations import local_rotations, turn_distances
 from geomocap.bodies.rigid_motions import _step_equations, fit_rigid_motion
-from geomocap.bodies.skin_blending import explain
+from geomocap.bodies.skin_blending import blend_spans, explain, places_at_rest
 from geomocap.bodies.surface_graph import bridges, lasting_distances, surface_graph
-from geomocap.model.motion_paths import DEPTH_FRACTION, sure_part
-from geomocap.model.rotations import turn_angles
+from geomocap.model.motion_paths import DEPTH_FRACTION, sure_part, within_ray
+from geomocap.model.rotations import nearest_rotation, rigid_motion, turn_angles
+from geomocap.model.small_systems import nearest_turn
+from geomocap.scheduling import limit_threads
 
 
 def test_lasting_distances_are_the_third_largest():
@@ -84,6 +86,92 @@ def test_rigid_motion_is_steady_against_samples_that_do_not_follow():
     assert residuals[:8].min() > residuals[8:].max()
 
 
+def test_nearest_turns_are_those_by_singular_values():
+    rng = np.random.default_rng(16)
+    matrices = rng.normal(size=(60, 3, 3))
+    matrices[::3, :, 2] = 0.0  # flat
+    matrices[1::3] *= 1e-8
+    found = np.empty_like(matrices)
+    for M, R in zip(matrices, found, strict=True):
+        nearest_turn(M, R)
+    np.testing.assert_allclose(found, nearest_rotation(matrices), atol=1e-11)
+    for M in (np.zeros((3, 3)), np.diag([0.0, 2.0, 0.0])):
+        nearest_turn(M, found[0])
+        np.testing.assert_array_equal(found[0], np.eye(3))
+
+
+def fitted_with_numpy(positions, rest, weights, least_scale, rounds=5, ray=None):
+    """What `fit_rigid_motion` returns, written with whole arrays."""
+    given, start = np.maximum(weights, 1e-9), 0 if ray is None else 3
+    robust = given
+    for k in range(start + rounds):
+        if ray is None or k < start:
+            R, t = rigid_motion(rest, positions.swapaxes(0, 1), robust.T, prior=1e-12 * np.eye(3))
+        else:
+            turned = np.einsum("tij,nj->nti", R, rest)
+            middle = (robust[..., None] * turned).sum(axis=0) / robust.sum(axis=0)[:, None]
+            x, y, z = np.moveaxis(turned - middle, 2, 0)
+            o = np.zeros_like(x)
+            arms = np.stack([np.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], -2)
+            J = np.concatenate([-arms, np.broadcast_to(np.eye(3), arms.shape)], axis=-1)
+            across = robust[..., None, None] * (
+                np.eye(3) - (1 - DEPTH_FRACTION**2) * ray[..., :, None] * ray[..., None, :]
+            )
+            normal = np.einsum("ntki,ntkl,ntlj->tij", J, across, J)
+            right = np.einsum("ntki,ntkl,ntl->ti", J, across, positions - turned - t)
+            normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(6)
+            step = np.linalg.solve(normal, right[..., None])[..., 0]
+            turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
+            R, t = turn @ R, t + step[:, 3:] + middle - np.einsum("tij,tj->ti", turn, middle)
+        miss = np.linalg.norm(sure_part(np.einsum("tij,nj->nti", R, rest) + t - positions, ray), axis=2)
+        residuals = np.sqrt((given * miss**2).sum(axis=1) / given.sum(axis=1))
+        scale = 2 * max(np.median(residuals), least_scale)
+        robust = given / (1 + (residuals / scale) ** 4)[:, None] / (1 + (miss / (2 * scale)) ** 4)
+    return R, t, residuals
+
+
+def loose_body(count: int, frames: int) -> tuple[np.ndarray, ...]:
+    """A moving body of which some samples go astray, some are not seen, and most have rays."""
+    rng = np.random.default_rng(13)
+    rest = rng.normal(scale=0.1, size=(count, 3)) + 1.0
+    true = Rotation.from_rotvec(rng.normal(scale=0.5, size=(frames, 3))).as_matrix()
+    positions = np.einsum("tij,nj->nti", true, rest) + rng.normal(scale=2e-3, size=(count, frames, 3))
+    positions[: count // 6] += rng.normal(scale=0.05, size=(count // 6, frames, 3))
+    weights = rng.random((count, frames)) * (rng.random((count, frames)) > 0.1)
+    ray = rng.normal(size=(count, frames, 3)) * (rng.random((count, frames, 1)) > 0.3)
+    return positions, rest, weights, ray / np.maximum(np.linalg.norm(ray, axis=2, keepdims=True), 1e-12)
+
+
+@pytest.mark.parametrize("rays", [False, True])
+def test_a_rigid_motion_is_that_of_whole_arrays(rays):
+    positions, rest, weights, ray = loose_body(40, 12)
+    ray = ray if rays else None
+    found = fit_rigid_motion(positions, rest, weights, 1e-4, ray=ray)
+    for one, other in zip(found, fitted_with_numpy(positions, rest, weights, 1e-4, ray=ray), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("rays", [False, True])
+def test_a_rigid_motion_is_the_same_for_any_number_of_threads(rays):
+    positions, rest, weights, ray = loose_body(210, 101)  # enough for other threads
+    found = []
+    for count in (1, None):
+        limit_threads(count)
+        found.append(fit_rigid_motion(positions, rest, weights, 1e-4, ray=ray if rays else None))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_motion_that_few_samples_leave_open_is_the_one_without_turn(count):
+    rest = np.array([[0.1, 0.2, 0.3], [0.1, 0.2, 0.4]])[:count]
+    positions = np.repeat(rest[:, None], 3, axis=1) + np.arange(3.0)[:, None]
+    rotations, translations, residuals = fit_rigid_motion(positions, rest, np.ones((count, 3)), 0.0)
+    np.testing.assert_allclose(rotations, np.tile(np.eye(3), (3, 1, 1)), atol=1e-3)
+    np.testing.assert_allclose(rest @ rotations.swapaxes(1, 2) + translations[:, None], positions.swapaxes(0, 1))
+    assert residuals.max() < 1e-12
+
+
 def seen_by_single_cameras(noise_along: float) -> tuple[np.ndarray, ...]:
     """A turning body whose samples three cameras see, each one alone: true motion, positions, rays."""
     rng = np.random.default_rng(8)
@@ -93,6 +181,42 @@ def seen_by_single_cameras(noise_along: float) -> tuple[np.ndarray, ...]:
     ray = np.repeat(np.eye(3)[np.arange(60) % 3][:, None], 6, axis=1)
     off = rng.normal(scale=noise_along, size=(60, 6, 1)) * ray + rng.normal(scale=1e-3, size=(60, 6, 3))
     return rest, true, positions + off, ray
+
+
+@pytest.mark.parametrize("rays", [False, True])
+def test_places_at_rest_are_the_least_squares_ones(rays):
+    positions, _, weights, ray = loose_body(12, 8)
+    weights[3] = 0.0
+    rng = np.random.default_rng(14)
+    rotations = Rotation.from_rotvec(rng.normal(size=(16, 3))).as_matrix().reshape(2, 8, 3, 3)
+    translations, label, samples = rng.normal(size=(2, 8, 3)), np.arange(12) % 2, np.array([1, 3, 4, 9])
+    ray = ray if rays else None
+    found = places_at_rest(samples, label, positions, weights, ray, rotations, translations)
+    for place, i in zip(found, samples, strict=True):
+        R, t, w = rotations[label[i]], translations[label[i]], weights[i]
+        if not w.any():
+            np.testing.assert_array_equal(place, 0.0)
+            continue
+        direction = np.zeros((8, 3)) if ray is None else ray[i]
+        seen = within_ray(positions[i], t, direction)
+        across = np.eye(3) - (1 - DEPTH_FRACTION**2) * direction[:, :, None] * direction[:, None, :]
+        normal = np.einsum("t,tki,tkl,tlj->ij", w, R, across, R)
+        expected = np.linalg.solve(normal, np.einsum("t,tki,tk->i", w, R, seen - t))
+        np.testing.assert_allclose(place, expected, rtol=1e-9)
+
+
+def test_spans_of_blends_are_variances_of_what_is_between_the_bodies():
+    rng = np.random.default_rng(15)
+    rotations = Rotation.from_rotvec(rng.normal(size=(18, 3))).as_matrix().reshape(3, 6, 3, 3)
+    translations, rest, weights = rng.normal(size=(3, 6, 3)), rng.normal(size=(4, 3)), rng.random((4, 6))
+    main, partner = np.array([0, 1, 2, 1]), np.array([1, -1, 0, 2])
+    carried = np.einsum("btij,nj->bnti", rotations, rest) + translations[:, None]
+    found = blend_spans(main, partner, weights, rest, rotations, translations)
+    for n in range(4):
+        apart = carried[main[n], n] - carried[partner[n], n]
+        middle = np.average(apart, axis=0, weights=weights[n])
+        expected = np.average(((apart - middle) ** 2).sum(axis=1), weights=weights[n]) if partner[n] >= 0 else 0.0
+        np.testing.assert_allclose(found[n], expected, rtol=1e-9)
 
 
 def test_what_is_unsure_along_the_ray_does_not_turn_a_body():
