@@ -77,8 +77,8 @@ CASES = {
     "soft limbs, tracks": Case(partial(doll, limb_bones=2), 16.0, perfect_tracks, Gate(0.97, 1.0, 0.5)),
     # A soft trunk of two bodies between others is no third one in small images.
     "soft trunk, images": Case(partial(doll, limb_bones=0), 40.0, small_images, Gate(0.95, 1.0, 1.0), 20),
-    # Core index 0.97 and 0.98, joints 3.2 to 4.4 %: all of it along the hinges' axes, where only the bodies' borders say
-    # where a joint is, and 0.05 % across. Rotations 0.1 and 0.2° (two captures).
+    # Core index 0.97 and 0.98, joints 3.2 to 4.4 %, all of it along the hinges' axes, where only the bodies' borders
+    # say where a joint is, and 0.05 % across. Rotations 0.1 and 0.2° (two captures).
     "hinges, images": Case(fan, 30.0, small_images, Gate(0.9, 5.5, 1.0, near=10)),
 }
 

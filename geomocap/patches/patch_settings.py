@@ -65,8 +65,8 @@ class TrackingSettings(Settings):
         0.03, ge=0, lt=1, description="How far behind the surface a new patch is looked for (fraction of the diagonal)"
     )
     # How precise a position is tells more than the correlation, which noise lowers on weak texture. With 0.75 instead
-    # of 0.85 patches of a person before four real cameras lasted half as long again (median 26 frames instead of 18);
-    # of a man in plain clothes before eight they drifted by 2.15 mm instead of 2.11 (median), 9.3 instead of 9.4 (95 %).
+    # of 0.85 patches of a person before four real cameras lasted for 26 frames instead of 20 (median); those of a man
+    # in plain clothes before eight drifted by 2.15 mm instead of 2.11 (median), and by 9.3 instead of 9.4 (95 %).
     correlation: float = Field(0.75, gt=0, lt=1, description="Least mean correlation of a tracked patch")
     camera_correlation: float = Field(0.6, gt=0, lt=1, description="Least correlation for a camera to count")
     n_views: int = Field(2, ge=2, description="Least number of cameras that agree on a new patch")
