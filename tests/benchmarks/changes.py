@@ -79,6 +79,26 @@ def perfect_tracks(truth: Path, scans: Path) -> None:
     np.savez(scans, points=np.stack([places.of(surface.points) for surface in frames]))
 
 
+def worse_tracks(noise: float = 0.0, length: int | None = None) -> Callable[[Path, Path], None]:
+    """Make the same tracks with noise (standard deviation of a coordinate, metres), each there for `length` frames.
+
+    These begin anywhere, also before the first frame.
+    """
+
+    def make(truth: Path, scans: Path) -> None:
+        perfect_tracks(truth, scans)
+        rng = np.random.default_rng(0)
+        points = np.load(scans)["points"]
+        points += noise * rng.standard_normal(points.shape)
+        if length is not None:
+            begin = rng.integers(1 - length, len(points), points.shape[1])
+            since = np.arange(len(points))[:, None] - begin
+            points[(since < 0) | (since >= length)] = np.nan
+        np.savez(scans, points=points)
+
+    return make
+
+
 def fresh_samples(truth: Path, scans: Path) -> None:
     """Make scans of the true surface, 4,096 points in any order, sampled anew in each frame."""
     rng = np.random.default_rng(0)

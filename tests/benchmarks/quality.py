@@ -3,7 +3,8 @@
 `python -m tests.benchmarks.quality FOLDER [NAME …]` synthesizes each capture into FOLDER, runs it with the defaults,
 compares it with its truth and prints one row each. What is there already is taken, so that it may be stopped and
 shared between processes; each figure keeps the commit that it was measured with. `--results FILE.toml` puts the rows
-into a table of `docs/results`. Captures of characters that are files need the folder of data in `GEOMOCAP_DATA`.
+into a table of `docs/results`. `--noise` measures perfect tracks with noise, and cut short, instead. Captures of
+characters that are files need the folder of data in `GEOMOCAP_DATA`.
 """
 
 from __future__ import annotations
@@ -20,16 +21,27 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from data_tools.asset import AnimatedAsset
 from data_tools.figure import figure, mechanism
 from data_tools.gltf_reader import load_gltf
-from data_tools.synthesize import SynthesisSettings, synthesize
-from tests.benchmarks.changes import crop, different_cameras, fresh_samples, give_silhouettes, perfect_tracks, reverse
+from data_tools.synthesize import SynthesisSettings, synthesize, write_truth
+from tests.benchmarks.changes import (
+    crop,
+    different_cameras,
+    fresh_samples,
+    give_silhouettes,
+    perfect_tracks,
+    reverse,
+    worse_tracks,
+)
 from tests.benchmarks.creatures import fan, runner, snake, spider
 from tools.result_tables import ROOT, measured_now, read_table
 
 DATA = Path(os.environ.get("GEOMOCAP_DATA", "."))
 TABLE = ROOT / "docs" / "results" / "whole-runs.toml"
+NOISES = (0, 2, 5, 10, 20)  # mm
 
 
 def man() -> AnimatedAsset:
@@ -72,6 +84,14 @@ SUBJECTS = {
     "horse rearing": horse("Rear"),
     "horse kicking": horse("Kick"),
 }
+IN_NOISE = {
+    f"{name}, {how}": Case(subject, scans=scans)
+    for name, subject in {"man": man, "horse": SUBJECTS["horse walking"], "mechanism": mechanism}.items()
+    for how, scans in {
+        **{f"{noise} mm": worse_tracks(noise / 1000) for noise in NOISES},
+        "15 frames": worse_tracks(length=15),
+    }.items()
+}
 CASES = {
     "man walking, 30 fps": Case(man),
     "the same, 15 fps": Case(man, {"fps": 15}),
@@ -110,7 +130,7 @@ def folder_name(name: str) -> str:
 
 def measure(name: str, root: Path) -> dict[str, Any]:
     """Make a capture, run it and compare it with its truth, unless that was done before: the row of the results."""
-    case, folder = CASES[name], root / folder_name(name)
+    case, folder = (CASES | IN_NOISE)[name], root / folder_name(name)
     figures, origin = folder / "figures.json", folder / "origin.json"
     if not (figures.exists() and origin.exists()):
         seed = int(case.flags[case.flags.index("--tracking.seed") + 1]) if "--tracking.seed" in case.flags else 0
@@ -118,7 +138,8 @@ def measure(name: str, root: Path) -> dict[str, Any]:
         capture, truth, run = folder / "capture", folder / "truth", folder / "run"
         if case.change is not None or not (capture / "capture.toml").exists():
             shutil.rmtree(folder, ignore_errors=True)
-            synthesize(case.subject(), capture, truth, SynthesisSettings(**case.synthesis))
+            make = synthesize if case.scans is None else _without_images
+            make(case.subject(), capture, truth, SynthesisSettings(**case.synthesis))
         if case.change is not None:
             case.change(capture, truth)
         if case.scans is None:
@@ -131,6 +152,11 @@ def measure(name: str, root: Path) -> dict[str, Any]:
         origin.write_text(json.dumps(began, default=str))
     came = json.loads(origin.read_text())
     return row(name, json.loads(figures.read_text())) | came | {"date": date.fromisoformat(came["date"])}
+
+
+def _without_images(asset: AnimatedAsset, _: Path, truth: Path, settings: SynthesisSettings) -> None:
+    times = np.arange(settings.frames) / settings.fps
+    write_truth(asset, times, np.array([asset.vertices(t) for t in times]), settings, truth)
 
 
 def row(name: str, figures: dict[str, float]) -> dict[str, Any]:
@@ -161,12 +187,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("names", nargs="*", metavar="NAME")
+    parser.add_argument("--noise", action="store_true", help="tracks with noise, and short ones")
     parser.add_argument("--results", type=Path, help="table of results that takes the rows, docs/results/….toml")
     arguments = parser.parse_args()
     layout = read_table(arguments.results or TABLE)
     columns = layout.values["columns"]
     print("| " + " | ".join(column["label"] for column in columns) + " |\n" + "|---" * len(columns) + "|")
-    for name in arguments.names or CASES:
+    for name in arguments.names or (IN_NOISE if arguments.noise else CASES):
         measured = measure(name, arguments.folder)
         print("| " + " | ".join(layout.cells(measured, columns)) + " |", flush=True)
         if arguments.results is not None:
