@@ -12,6 +12,7 @@ from geomocap.files.run import Run
 from tests.benchmarks.tiny_run import QUICK, VARIANTS, digests, make_tiny
 
 FRAMES = 26
+PIXEL = 0.03  # metres on the subject
 SETTINGS = [*QUICK[:-2], *VARIANTS["windows"]]
 KEYPOINT = """
 [[keypoint]]
@@ -40,10 +41,9 @@ def test_the_motion_goes_through_all_windows(made):
     assert [(made.path / "windows" / f / "poses.npz").is_file() for f in folders].count(False) == 1
     skeleton = read_skeleton(made)
     assert skeleton.frame_count == FRAMES and np.isfinite(skeleton.joint_positions).all()
-    # where windows meet, joints don't jump: on what is as rough as this they move up to 1.6 times as fast as elsewhere
-    steps = np.linalg.norm(np.diff(skeleton.joint_positions, axis=0), axis=2).max(axis=1)
-    meeting = np.isin(np.arange(FRAMES - 1), [*range(7, 11), *range(14, 18)])
-    assert steps[meeting].max() < 2 * steps[~meeting].max()
+    # where windows meet, joints don't jump: they move by less than a pixel from frame to frame, as elsewhere
+    steps = np.linalg.norm(np.diff(skeleton.joint_positions, axis=0), axis=2)
+    assert steps.max() < PIXEL
     tracks = read_tracks(made).trajectories
     assert tracks.n_frames == FRAMES and tracks.measured.any(axis=0).all()
     assert made.frames("bodies") == list(range(FRAMES))
