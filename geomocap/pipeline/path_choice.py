@@ -39,8 +39,8 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
 
     They are "patches", "nodes", "both" (nodes held by patches and images), "pieces" (patches, and those nodes where
     these leave gaps), "points" or "ellipsoids". Nodes are followed only where patches leave a piece of the surface
-    uncovered; then "pieces" and "both" are returned. Where single cameras follow the surface that is where
-    these leave half of it; then "patches" and "both" are returned.
+    uncovered. Where single cameras follow the surface that is where these leave half of it; then "patches" and "both"
+    are returned.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
         return {"patches": patches, "both": held}
     # as far from each other as paths would be, were they all over the surface
     spacing = reach / float(np.sqrt(SMALLEST_PIECE * SAMPLES))
-    return {"pieces": _joined(patches, held, left_over(held.positions, patches.positions, spacing)), "both": held}
+    return {"pieces": _joined(patches, held, left_over(held.positions, patches.positions, spacing))}
 
 
 def _follow_nodes(job: Job, geometry: Geometry, anchors: MotionPaths | None) -> MotionPaths:
