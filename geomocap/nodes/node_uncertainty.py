@@ -12,8 +12,8 @@ from geomocap.nodes.node_graph import NodeGraph
 # Standard deviation of a coordinate, fraction of the distance from the nearest anchor. Against the truth, before eight
 # cameras and from 0.5 to 20 % of the diagonal away, medians of the error's length were 2 to 10 % of the distance on a
 # horse and a walking dwarf, 35 to 60 % on a spinning one; one node in ten errs three to eleven times as much. Bodies of
-# five such captures were alike with 0.1 and 0.3; with 0.04 there were more of them that aren't, and
-# with 0.3 one more of a fan in small images.
+# four of five such captures were alike with 0.1 and 0.3; with 0.3 a bird had better cores and more false edges, and a
+# fan in small images a body too many, as it had with 0.04.
 _SWAY = 0.1
 
 

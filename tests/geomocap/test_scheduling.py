@@ -7,9 +7,12 @@ import threading
 
 import cv2
 import numba
+import numpy as np
 import pytest
 
+from geomocap.bodies.rigid_motions import fit_rigid_motion
 from geomocap.scheduling import limit_threads, map_items, spread, threads
+from tests.geomocap.test_surface_samples import loose_body
 
 
 def test_results_come_in_order_and_progress_is_told():
@@ -85,3 +88,17 @@ def test_a_limit_holds_for_executors_and_kernels_made_afterwards():
     with threads() as executor:
         assert executor._max_workers == (os.cpu_count() or 1)
     assert numba.get_num_threads() == numba.config.NUMBA_NUM_THREADS
+
+
+@pytest.mark.parametrize("rays", [False, True])
+def test_a_rigid_motion_is_the_same_for_any_number_of_threads(rays):
+    positions, rest, weights, ray = loose_body(210, 101)  # enough for other threads
+    found = []
+    try:
+        for count in (1, None):
+            limit_threads(count)
+            found.append(fit_rigid_motion(positions, rest, weights, 1e-4, ray=ray if rays else None))
+    finally:
+        limit_threads(None)
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)

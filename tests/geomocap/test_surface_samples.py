@@ -13,7 +13,6 @@ from geomocap.bodies.surface_graph import bridges, lasting_distances, surface_gr
 from geomocap.model.motion_paths import DEPTH_FRACTION, sure_part, within_ray
 from geomocap.model.rotations import nearest_rotation, rigid_motion, turn_angles
 from geomocap.model.small_systems import nearest_turn
-from geomocap.scheduling import limit_threads
 
 
 def test_lasting_distances_are_the_third_largest():
@@ -149,17 +148,6 @@ def test_a_rigid_motion_is_that_of_whole_arrays(rays):
     found = fit_rigid_motion(positions, rest, weights, 1e-4, ray=ray)
     for one, other in zip(found, fitted_with_numpy(positions, rest, weights, 1e-4, ray=ray), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11)
-
-
-@pytest.mark.parametrize("rays", [False, True])
-def test_a_rigid_motion_is_the_same_for_any_number_of_threads(rays):
-    positions, rest, weights, ray = loose_body(210, 101)  # enough for other threads
-    found = []
-    for count in (1, None):
-        limit_threads(count)
-        found.append(fit_rigid_motion(positions, rest, weights, 1e-4, ray=ray if rays else None))
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("count", [1, 2])
