@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from geomocap.bodies.motion_bodies import MotionBodies
@@ -10,6 +11,7 @@ from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.surface import plane_normals
 
 _VOTERS = 12
+_LEAST_VOTES = 0.05  # fraction of all, of a body that is proposed
 _NEAREST = 3
 _PLANE = 8
 _THICKNESS = 0.7
@@ -68,13 +70,13 @@ def _label_some(
     distances, nearest = tree.query(points, voters)
     distances, nearest = distances.reshape(len(points), voters), nearest.reshape(len(points), voters)
     votes = trust[nearest] / (distances**2 + (0.5 * spacing) ** 2)
-    score = np.zeros((len(points), bodies.body_count))
-    for v in range(voters):
-        score += votes[:, v, None] * bodies.weights[nearest[:, v]]
+    rows = np.arange(0, votes.size + 1, voters)
+    score = csr_matrix((votes.ravel(), nearest.ravel(), rows), (len(points), tree.n)) @ bodies.weights
     score /= score.sum(axis=1, keepdims=True)
+    score[score <= _LEAST_VOTES] = 0.0
+    doubtful = (score > 0).sum(axis=1) > 1
     for b in range(bodies.body_count):
-        proposed = np.flatnonzero(score[:, b] > 0.05)
-        score[score[:, b] <= 0.05, b] = 0.0
+        proposed = np.flatnonzero(doubtful & (score[:, b] > 0))
         if not len(proposed):
             continue
         back = (points[proposed] - bodies.translations[frame, b]) @ bodies.rotations[frame, b]

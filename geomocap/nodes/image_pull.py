@@ -181,12 +181,13 @@ def window_pulls(now, P, mask_now, then, Q, mask_then, y, e, y0, e0, step, seen,
     side = 2 * half + 1
     size = side**2
     value, slope, on = np.empty(size), np.empty((size, 3)), np.empty(size, np.bool_)
-    r, which = np.empty(size), np.empty(size, np.int64)
     across = np.empty((size, 2))
     for n in range(size):
         across[n, 0], across[n, 1] = n // side - half, n % side - half
     # places on the images are quotients of what is linear in the window's rows and columns
     o, di, dj = np.empty(3), np.empty(3), np.empty(3)
+    # sums of slopes and of their products over the window's pixels, and over those that an earlier frame hasn't
+    some, products, less, products_less, pulled = np.empty(3), np.empty(6), np.empty(3), np.empty(6), np.empty(3)
     height, width = mask_now.shape[1:]
     for s in range(len(y)):
         for c in range(len(P)):
@@ -199,6 +200,8 @@ def window_pulls(now, P, mask_now, then, Q, mask_then, y, e, y0, e0, step, seen,
             # this frame's values, and how they change with the sample's place
             _project_window(P[c], y[s], e[s], step[s, c], o, di, dj)
             image = now[c]
+            there = 0
+            some[:], products[:] = 0.0, 0.0
             for n in range(size):
                 i, j = across[n, 0], across[n, 1]
                 on[n] = False
@@ -212,6 +215,7 @@ def window_pulls(now, P, mask_now, then, Q, mask_then, y, e, y0, e0, step, seen,
                 if mask_now[c, int(v + 0.5), int(u + 0.5)] == 0:
                     continue
                 on[n] = True
+                there += 1
                 # value and half the central differences there, all bilinear
                 row, col = int(v), int(u)
                 a, d = u - col, v - row
@@ -226,57 +230,54 @@ def window_pulls(now, P, mask_now, then, Q, mask_then, y, e, y0, e0, step, seen,
                 gx, gy = 0.5 * gx * w, 0.5 * gy * w
                 for m in range(3):
                     slope[n, m] = gx * (P[c, 0, m] - u * P[c, 2, m]) + gy * (P[c, 1, m] - v * P[c, 2, m])
+                _count_slope(slope[n], some, products)
+            if there < _LEAST_FILLED * size:
+                continue
             for k in range(len(then)):
                 if not seen[k, s, c]:
                     continue
                 _project_window(Q[k][c], y0[k, s], e0[k, s], step[s, c], o, di, dj)
                 before, mask = then[k][c], mask_then[k][c]
                 high, wide = mask.shape
-                found = 0
-                mr, m0, m1, m2 = 0.0, 0.0, 0.0, 0.0
+                found, total, squares = 0, 0.0, 0.0
+                less[:], products_less[:], pulled[:] = 0.0, 0.0, 0.0
                 for n in range(size):
                     if not on[n]:
                         continue
                     i, j = across[n, 0], across[n, 1]
                     w = o[2] + i * di[2] + j * dj[2]
-                    if w <= 0:
-                        continue
-                    w = 1.0 / w
+                    w = 1.0 / w if w > 0 else -1.0
                     u, v = w * (o[0] + i * di[0] + j * dj[0]), w * (o[1] + i * di[1] + j * dj[1])
-                    if not (u >= 0 and v >= 0 and u < wide - 1 and v < high - 1):
+                    inside = w > 0 and u >= 0 and v >= 0 and u < wide - 1 and v < high - 1
+                    if not inside or mask[int(v + 0.5), int(u + 0.5)] == 0:
+                        _count_slope(slope[n], less, products_less)
                         continue
-                    if mask[int(v + 0.5), int(u + 0.5)] == 0:
-                        continue
-                    r[found] = value[n] - _value(before, u, v)
-                    which[found] = n
-                    mr += r[found]
-                    m0 += slope[n, 0]
-                    m1 += slope[n, 1]
-                    m2 += slope[n, 2]
+                    r = value[n] - _value(before, u, v)
                     found += 1
+                    total += r
+                    squares += r * r
+                    for m in range(3):
+                        pulled[m] += slope[n, m] * r
                 if found < _LEAST_FILLED * size:
                     continue
                 count[k, s, c] = found
-                mr, m0, m1, m2 = mr / found, m0 / found, m1 / found, m2 / found
-                total = 0.0
-                b0, b1, b2 = 0.0, 0.0, 0.0
-                a00, a01, a02, a11, a12, a22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-                for h in range(found):
-                    n = which[h]
-                    g0, g1, g2, d = slope[n, 0] - m0, slope[n, 1] - m1, slope[n, 2] - m2, r[h] - mr
-                    total += d * d
-                    b0 += g0 * d
-                    b1 += g1 * d
-                    b2 += g2 * d
-                    a00 += g0 * g0
-                    a01 += g0 * g1
-                    a02 += g0 * g2
-                    a11 += g1 * g1
-                    a12 += g1 * g2
-                    a22 += g2 * g2
-                error[k, s, c] = total
-                b[k, s, c, 0], b[k, s, c, 1], b[k, s, c, 2] = b0, b1, b2
-                A[k, s, c, 0, 0], A[k, s, c, 1, 1], A[k, s, c, 2, 2] = a00, a11, a22
-                A[k, s, c, 0, 1] = A[k, s, c, 1, 0] = a01
-                A[k, s, c, 0, 2] = A[k, s, c, 2, 0] = a02
-                A[k, s, c, 1, 2] = A[k, s, c, 2, 1] = a12
+                error[k, s, c] = squares - total * total / found
+                at = 0
+                for m in range(3):
+                    mean = (some[m] - less[m]) / found
+                    b[k, s, c, m] = pulled[m] - mean * total
+                    for n in range(m, 3):
+                        A[k, s, c, m, n] = products[at] - products_less[at] - mean * (some[n] - less[n])
+                        A[k, s, c, n, m] = A[k, s, c, m, n]
+                        at += 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_slope(slope, total, products):
+    """Add a slope (3,) to a sum, and its products with itself, the upper triangle row by row (6,), to theirs."""
+    at = 0
+    for m in range(3):
+        total[m] += slope[m]
+        for n in range(m, 3):
+            products[at] += slope[m] * slope[n]
+            at += 1

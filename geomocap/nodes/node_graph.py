@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from geomocap.errors import GeometryError
 from geomocap.nodes.surface_points import PointSet
+
+_LEAST_LENGTH = 1e-12  # of a blend of normals
 
 
 @dataclass(frozen=True)
@@ -58,10 +62,9 @@ class NodeGraph:
 
         Source: R. Sumner et al., "Embedded deformation for shape manipulation", SIGGRAPH 2007, equation 2.
         """
-        turned = np.matmul(R[self.binding], self.offsets[..., None])[..., 0]
-        y = (self.weights[..., None] * (x[self.binding] + turned)).sum(axis=1)
-        n = np.matmul((self.weights[..., None, None] * R[self.binding]).sum(axis=1), self.normals[..., None])[..., 0]
-        return y, n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
+        places, normals = np.empty_like(self.samples), np.empty_like(self.normals)
+        deform(x, R, self.binding, self.weights, self.offsets, self.normals, places, normals)
+        return places, normals
 
     def strain(self, x: np.ndarray, R: np.ndarray) -> np.ndarray:
         """How far each edge is from moving rigidly with its two nodes, (E,), as a fraction of its length."""
@@ -71,6 +74,30 @@ class NodeGraph:
         of_i = edge - np.matmul(R[i], rest)[..., 0]
         of_j = edge - np.matmul(R[j], rest)[..., 0]
         return np.sqrt(((of_i**2).sum(axis=1) + (of_j**2).sum(axis=1)) / 2) / self.lengths
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def deform(x, R, binding, weights, offsets, normals, places, turned):
+    """Fill the places (S, 3) of samples and their turned normals (S, 3), see `NodeGraph.deform`."""
+    blend = np.empty((3, 3))
+    for s in range(len(binding)):
+        blend[:] = 0.0
+        places[s] = 0.0
+        for k in range(binding.shape[1]):
+            i, w = binding[s, k], weights[s, k]
+            o0, o1, o2 = offsets[s, k, 0], offsets[s, k, 1], offsets[s, k, 2]
+            for m in range(3):
+                places[s, m] += w * (x[i, m] + R[i, m, 0] * o0 + R[i, m, 1] * o1 + R[i, m, 2] * o2)
+                for n in range(3):
+                    blend[m, n] += w * R[i, m, n]
+        n0, n1, n2 = normals[s, 0], normals[s, 1], normals[s, 2]
+        square = 0.0
+        for m in range(3):
+            turned[s, m] = blend[m, 0] * n0 + blend[m, 1] * n1 + blend[m, 2] * n2
+            square += turned[s, m] ** 2
+        length = max(math.sqrt(square), _LEAST_LENGTH)
+        for m in range(3):
+            turned[s, m] /= length
 
 
 def farthest_points(positions: np.ndarray, count: int) -> np.ndarray:

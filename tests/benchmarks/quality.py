@@ -85,7 +85,7 @@ SUBJECTS = {
     "horse kicking": horse("Kick"),
 }
 IN_NOISE = {
-    f"{name}, {how}": Case(subject, scans=scans)
+    f"{name}, {how}": Case(subject, scans=scans, flags=("--paths", "points"))
     for name, subject in {"man": man, "horse": SUBJECTS["horse walking"], "mechanism": mechanism}.items()
     for how, scans in {
         **{f"{noise} mm": worse_tracks(noise / 1000) for noise in NOISES},
