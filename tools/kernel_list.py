@@ -56,7 +56,11 @@ def demo_calls(folder: Path) -> list[Call]:
 
     sys.argv = ["geomocap", "demo", str(folder), "--workers", "1"]
     with event.install_listener("numba:compile", Listener()):
-        geomocap.cli.main()
+        try:
+            geomocap.cli.main()
+        except SystemExit as end:
+            if end.code:
+                raise
     return calls
 
 
