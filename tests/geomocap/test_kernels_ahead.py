@@ -141,6 +141,13 @@ def test_the_second_process_ends_when_the_first_is_killed(empty_cache):
     assert not _alive(second)
 
 
+def test_the_second_process_ends_well_by_itself(empty_cache):
+    words = "import geomocap.kernels_ahead as k; k.listed = lambda: []; k.main()"
+    second = subprocess.Popen([sys.executable, "-c", words], stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert second.wait(60) == 0
+    assert second.communicate()[1] == b""
+
+
 def test_what_was_compiled_is_noted(empty_cache, monkeypatch):
     configure_numba()
     monkeypatch.setattr(kernels_ahead, "listed", lambda: [])
