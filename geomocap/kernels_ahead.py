@@ -123,7 +123,7 @@ def _end_with_parent() -> None:
 def main() -> None:
     """Compile the whole list, as the process beside another one."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    gc.disable()  # what is compiled stays
+    gc.set_threshold(100_000)  # compiling makes many objects that stay
     compile_listed(listed())
     done = _note()
     if done is not None:
