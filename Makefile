@@ -49,11 +49,13 @@ settings: .stamps/dev
 	$(BIN)/python -m tools.settings_page
 
 # Python compiles what is used when it is used first; the tests use most of it, in many processes
-# (a few packages bring files for other versions of Python, which can't be compiled).
+# (a few packages bring files for other versions of Python, which can't be compiled). The pip that comes with Python 3.11
+# takes twice as long as today's.
 .stamps/core: pyproject.toml tools/system_packages.sh
 	tools/system_packages.sh
 	"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11) and "geomocap needs Python 3.11 or newer: make PYTHON=/path/to/python3.11 …")'
 	"$(PYTHON)" -m venv $(VENV)
+	$(BIN)/pip install -q --no-compile -U pip
 	$(BIN)/pip install -q --no-compile -e .
 	mkdir -p .stamps && touch $@
 

@@ -19,6 +19,9 @@ from typing import TYPE_CHECKING, Any
 # Threads without work sleep instead of spinning: on a machine that does other things too, spinning makes short kernels
 # several times slower. Read when OpenMP is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+# Frames and parts of kernels are mapped over threads already; matrices here are long and thin, and multiplying them in
+# two threads takes up to twenty times as long as in one. Sums have one order, too, however many cores there are.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from geomocap.kernel_cache import configure_numba
 from geomocap.version import __version__

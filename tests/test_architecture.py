@@ -19,6 +19,7 @@ ROOMS: dict[str, set[str]] = {
     "scheduling": {"progress"},
     "version": set(),
     "kernel_cache": set(),
+    "kernels_ahead": set(),
     "source_digest": {"kernel_cache"},
     # nouns, then the one room that reads and writes them
     "model": BASE,

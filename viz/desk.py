@@ -15,13 +15,17 @@ from viz.report import Block, picture, plot
 
 @dataclass
 class Desk:
-    """What is being written: files in RUN/review, and their progress."""
+    """What is being written: files in RUN/review, and their progress.
+
+    `story` holds a row of pictures of each stage of the work, one for each frame, all seen from the same place.
+    """
 
     folder: Path
     progress: Progress
     total: int
     written: list[Path] = field(default_factory=list)
     done: int = 0
+    story: list[tuple[str, list[np.ndarray]]] = field(default_factory=list)
 
     def step(self) -> None:
         """Report one more part as done."""

@@ -123,7 +123,7 @@ def motion_video(
         i, frame = job
         azimuth = turn_deg * (i / max(len(frames) - 1, 1) - 0.5)
         view = stage.view(azimuth, 12.0, size)
-        skin = scene.body_skin(results, frame, 90)
+        skin = scene.rough_skin(results, frame, 90)
         bones = scene.skeleton(results, frame, stage.diagonal)
         panels, solid = [], Model([skin])
         if show_bodies:

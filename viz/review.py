@@ -145,20 +145,11 @@ def _result(
     blocks: list[Block] = []
     if turns is not None:
         blocks.append(turning(sheets.still(results, stage, frames[len(frames) // 2]), "The subject"))
-    rows: list[tuple[str, sheets.Builder]] = []
-    if {"voxels", "cloud"} & set(results.kinds):
-        rows.append(("volume" if "voxels" in results.kinds else "points", sheets.volume_meshes))
-    if results.ellipsoids is not None:
-        rows.append(("ellipsoids", sheets.ellipsoid_meshes))
-    if "bodies" in results.kinds:
-        rows.append(("bodies", sheets.body_meshes))
-    if results.skeleton is not None:
-        rows.append(("skeleton", sheets.skeleton_meshes))
     words = (
         "Each column is a frame, each row a stage of the work, seen from the same place. "
         "A body has the same colour in every picture of this report."
     )
-    stages = desk.sheet("stages", sheets.story_sheet(results, stage, frames, rows), "Stage by stage", words)
+    stages = desk.sheet("stages", sheets.frames_sheet(desk.story, frames), "Stage by stage", words)
     path = film()
     if path is not None:
         desk.written.append(path)
@@ -204,9 +195,9 @@ def _volume(results: Results, stage: ViewStage | None, frames: list[int], desk: 
         "The volume in its own colours from four sides. Look for limbs grown together, phantom parts where no camera "
         "could tell empty from full, and parts cut off."
     )
-    blocks = desk.sheet(
-        "volume", sheets.geometry_sheet(results, stage, frames, sheets.volume_meshes), kind.title(), words
-    )
+    name = "volume" if kind == "voxels" else "points"
+    image = _views(results, stage, frames, name, sheets.volume_meshes, desk)
+    blocks = desk.sheet("volume", image, kind.title(), words)
     numbers = {k: (results.run.frames(k), v) for k, v in results.counts.items() if k != "bodies"}
     if numbers and len(results.frames) > 1:
         words = "Surface voxels or points in each frame. Jumps point to frames with bad silhouettes."
@@ -273,7 +264,7 @@ def _ellipsoids(results: Results, stage: ViewStage | None, frames: list[int], de
     if stage is None or e is None:
         return [missing("The run has no ellipsoids.")]
     words = "The ellipsoids fitted to parts of the volume, in the colours of the bodies that they were joined to."
-    image = sheets.geometry_sheet(results, stage, frames, sheets.ellipsoid_meshes)
+    image = _views(results, stage, frames, "ellipsoids", sheets.ellipsoid_meshes, desk)
     blocks = desk.sheet("ellipsoids", image, f"{e.centers.shape[1]} ellipsoids", words)
     if len(e.centers) < 2:
         return [*blocks, missing("One frame has no paths, so nothing tells the bodies apart.")]
@@ -299,7 +290,7 @@ def _bodies(results: Results, stage: ViewStage | None, frames: list[int], desk: 
     if stage is None or "bodies" not in results.kinds:
         return [missing("The run has no rigid bodies.")]
     words = "Each body in its colour, grey what belongs to none. Borders should lie where the subject bends."
-    image = sheets.geometry_sheet(results, stage, frames, sheets.body_meshes)
+    image = _views(results, stage, frames, "bodies", sheets.body_meshes, desk)
     blocks = desk.sheet("bodies", image, "Rigid bodies", words)
     words = "The bodies over the images of all cameras. Where their border leaves the subject's, the volume is wrong."
     middle = [frames[len(frames) // 2]]
@@ -343,7 +334,7 @@ def _skeleton(
     words = (
         "The skeleton inside the translucent volume. Joints should sit where limbs bend, in the middle of the flesh."
     )
-    image = sheets.geometry_sheet(results, stage, frames, sheets.skeleton_meshes)
+    image = _views(results, stage, frames, "skeleton", sheets.skeleton_meshes, desk)
     blocks = desk.sheet("skeleton", image, "Skeleton", words)
     if _calibrated(results):
         middle = [frames[len(frames) // 2]]
@@ -383,6 +374,15 @@ def _keypoints(results: Results, stage: ViewStage | None, frames: list[int], des
     words = "Each should stay on the same spot of the subject. Orange: bridged, no trajectory inside in this frame."
     over = keypoint_plots.overlay_sheet(results, marks, frames)
     return blocks + desk.sheet("keypoints_overlay", over, "Key-points over the pictures", words)
+
+
+def _views(
+    results: Results, stage: ViewStage, frames: list[int], name: str, build: sheets.Builder, desk: Desk
+) -> np.ndarray:
+    """Draw one kind of geometry from several sides; the first of them is what the story shows of it."""
+    rows = sheets.geometry_views(results, stage, frames, build)
+    desk.story.append((name, rows[0]))
+    return sheets.frames_sheet(list(zip(sheets.VIEWS, rows, strict=True)), frames)
 
 
 def _times(results: Results, desk: Desk) -> list[Block]:

@@ -34,6 +34,7 @@ from geomocap.model.frame_geometry import BodyPoints, Voxels
 from geomocap.model.keypoint_paths import KeyPoints
 from geomocap.model.skeleton import Skeleton
 from geomocap.model.trajectories import Tracks
+from viz.kept_values import KeptValues
 
 KINDS = ("bodies", "voxels", "cloud")
 
@@ -48,6 +49,11 @@ class Results:
     run: Run
     capture: Capture | None = None
     names: Names | None = None
+
+    @cached_property
+    def kept(self) -> KeptValues:
+        """Meshes of the last frames that were drawn."""
+        return KeptValues()
 
     @cached_property
     def record(self) -> dict[str, Any]:

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from geomocap.model.frame_geometry import Voxels
 from viz import body_colors as palette
 from viz.run_contents import Results
 from viz.shapes import EMPTY, Mesh, ball, bone, ellipsoid, join, tube
 from viz.viewpoints import ViewStage, stage_of, up_vector
-from viz.volumes import cubes, gems, skin, spacing
+from viz.volumes import black_cubes, gems, skin, spacing
 
 GLASS = (128, 146, 168)
 """Colour of the translucent volume, RGB 0–255."""
@@ -33,11 +34,23 @@ def stage(results: Results, samples: int = 10) -> ViewStage:
 def volume(results: Results, frame: int) -> Mesh:
     """Return a frame's voxels as cubes in their colours, or its cloud as points."""
     if results.has("voxels", frame):
-        v = results.voxels(frame)
-        return cubes(v.indices, v.origin, v.voxel_size, v.colors)
+        grid = results.voxels(frame)
+        return _cubes(results, frame, grid, grid.indices, grid.colors)
     if results.has("cloud", frame):
         return cloud(results, frame)
     return EMPTY
+
+
+def _cubes(results: Results, frame: int, grid: Voxels, indices: np.ndarray, colors: np.ndarray) -> Mesh:
+    """Voxels (N, 3) int of a frame's grid as cubes in colours (N, 3) uint8; they are built once for all colours."""
+
+    def build() -> tuple[np.ndarray, Mesh, np.ndarray]:
+        return indices, *black_cubes(indices, grid.origin, grid.voxel_size)
+
+    known, mesh, voxel = results.kept.value(("cubes", frame), build)
+    if not np.array_equal(known, indices):
+        _, mesh, voxel = build()
+    return replace(mesh, colors=colors[voxel] / 255.0)
 
 
 def cloud(results: Results, frame: int) -> Mesh:
@@ -57,12 +70,20 @@ def bodies(results: Results, frame: int) -> Mesh:
     if results.has("voxels", frame):
         grid = results.voxels(frame)
         indices = np.floor((b.positions - grid.origin) / grid.voxel_size).astype(int)
-        return replace(cubes(indices, grid.origin, grid.voxel_size, colors), outlined=True)
+        return replace(_cubes(results, frame, grid, indices, colors), outlined=True)
     return replace(gems(b.positions, colors, 0.75 * spacing(b.positions), b.normals), outlined=True)
 
 
-def body_skin(results: Results, frame: int, cells: int = 110) -> Mesh:
-    """Return a smooth skin around a frame's points in the colours of the bodies, or in one colour without bodies."""
+def body_skin(results: Results, frame: int) -> Mesh:
+    """Return the skin that pictures of a frame show; see `rough_skin`."""
+    return results.kept.value(("skin", frame), lambda: rough_skin(results, frame, 110))
+
+
+def rough_skin(results: Results, frame: int, cells: int) -> Mesh:
+    """Return a smooth skin around a frame's points in the colours of the bodies, or in one colour without bodies.
+
+    It has at most so many cells along its longest side.
+    """
     if results.has("bodies", frame):
         b = results.bodies(frame)
         return skin(b.positions, palette.body_colors(b.body), cells)

@@ -82,10 +82,10 @@ def path_meshes(results: Results, frame: int) -> list[Mesh]:
     return [skin.recolored(scene.GLASS).translucent(0.08, 0.35), scene.paths(results, size)]
 
 
-def geometry_sheet(
+def geometry_views(
     results: Results, stage: ViewStage, frames: Sequence[int], build: Builder, views: Sequence[str] = tuple(VIEWS)
-) -> np.ndarray:
-    """Return a sheet of one kind of geometry: frames as columns, free views as rows."""
+) -> list[list[np.ndarray]]:
+    """Return pictures of one kind of geometry: for each free view those of all frames."""
     seen_from = [stage.view(*VIEWS[v], tile_size(stage, *VIEWS[v])) for v in views]
 
     def column(frame: int) -> list[np.ndarray]:
@@ -94,8 +94,12 @@ def geometry_sheet(
 
     with threads() as executor:
         columns = list(map_items(column, list(frames), executor))
-    labels = [f"frame {f}" for f in frames]
-    return sheet([list(row) for row in zip(*columns, strict=True)], views, labels)
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def frames_sheet(rows: Sequence[tuple[str, list[np.ndarray]]], frames: Sequence[int]) -> np.ndarray:
+    """Return a sheet with named rows of pictures, frames as columns."""
+    return sheet([pictures for _, pictures in rows], [name for name, _ in rows], [f"frame {f}" for f in frames])
 
 
 def still(results: Results, stage: ViewStage, frame: int, size: tuple[int, int] = (1440, 900)) -> np.ndarray:
@@ -110,21 +114,6 @@ def path_sheet(results: Results, stage: ViewStage, frame: int) -> np.ndarray:
     model = Model(path_meshes(results, frame))
     seen_from = [stage.view(*angles, tile_size(stage, *angles, 130_000 * DENSITY**2)) for angles in VIEWS.values()]
     return sheet([[picture(results, stage, model, view, frame) for view in seen_from]], (), tuple(VIEWS))
-
-
-def story_sheet(
-    results: Results, stage: ViewStage, frames: Sequence[int], rows: Sequence[tuple[str, Builder]]
-) -> np.ndarray:
-    """Return the way from the geometry to the skeleton: stages as rows, frames as columns, one view."""
-    azimuth, elevation = VIEWS["three-quarter"]
-    view = stage.view(azimuth, elevation, tile_size(stage, azimuth, elevation))
-
-    def column(frame: int) -> list[np.ndarray]:
-        return [picture(results, stage, Model(build(results, frame)), view, frame) for _, build in rows]
-
-    with threads() as executor:
-        columns = list(map_items(column, list(frames), executor))
-    return sheet([list(r) for r in zip(*columns, strict=True)], [n for n, _ in rows], [f"frame {f}" for f in frames])
 
 
 def silhouette_sheet(results: Results, frames: Sequence[int], width: int = 250 * DENSITY) -> np.ndarray | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
@@ -32,7 +34,13 @@ def spacing(points: np.ndarray, tree: cKDTree | None = None) -> float:
 
 
 def cubes(indices: np.ndarray, origin: np.ndarray, size: float, colors: np.ndarray) -> Mesh:
-    """Return voxels as cubes, without the sides that two of them share.
+    """Return voxels as cubes in colours (N, 3) uint8, RGB; see `black_cubes`."""
+    mesh, voxel = black_cubes(indices, origin, size)
+    return replace(mesh, colors=colors[voxel] / 255.0)
+
+
+def black_cubes(indices: np.ndarray, origin: np.ndarray, size: float) -> tuple[Mesh, np.ndarray]:
+    """Return voxels as cubes, without the sides that two of them share, and the voxel of each triangle.
 
     The shading normals lean towards the surface that the voxels together make, so that its shape shows as well.
 
@@ -43,28 +51,33 @@ def cubes(indices: np.ndarray, origin: np.ndarray, size: float, colors: np.ndarr
         Lowest corner of voxel (0, 0, 0), metres.
     size : float
         Edge of a voxel, metres.
-    colors : (N, 3) uint8, RGB
+
+    Returns
+    -------
+    mesh : Mesh
+    voxel : (F,) int
     """
     if len(indices) == 0:
-        return EMPTY
+        return EMPTY, np.zeros(0, np.int64)
     low = indices.min(axis=0) - 1
     local = indices - low
     filled = np.zeros(local.max(axis=0) + 2, bool)
     filled[tuple(local.T)] = True
     smooth = outward_normals((indices + 0.5) * size)
-    vertices, normals, face_colors = [], [], []
+    vertices, normals, owners = [], [], []
     for side, corners in zip(_SIDES, _CORNERS, strict=True):
         free = ~filled[tuple((local + side).T)]
         vertices.append((indices[free, None] + corners[None]).reshape(-1, 3))
         lean = smooth[free] * np.where(smooth[free] @ side >= 0, 1.0, -1.0)[:, None]
         blend = 0.8 * lean + 0.4 * side
         normals.append(np.repeat(blend / np.linalg.norm(blend, axis=1, keepdims=True), 4, axis=0))
-        face_colors.append(np.repeat(colors[free] / 255.0, 2, axis=0))
+        owners.append(np.repeat(np.flatnonzero(free), 2))
     count = sum(len(v) for v in vertices) // 4
     first = 4 * np.arange(count)[:, None]
     faces = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])], axis=1).reshape(-1, 3)
     positions = np.asarray(origin, float) + np.concatenate(vertices) * size
-    return Mesh(positions, faces, np.concatenate(normals), np.concatenate(face_colors), outlined=False)
+    black = np.zeros((len(faces), 3))
+    return Mesh(positions, faces, np.concatenate(normals), black, outlined=False), np.concatenate(owners)
 
 
 def gems(points: np.ndarray, colors: np.ndarray, radius: float, normals: np.ndarray | None = None) -> Mesh:

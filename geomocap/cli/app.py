@@ -39,7 +39,7 @@ COMMANDS = {
     ),
     "import": ("capture_commands.import_", "Turn another tool's session into a capture."),
     "demo": (
-        "capture_commands.demo",
+        "demo_command.demo",
         "Synthesize a small capture of the built-in figure and take it all the way to the report.",
     ),
     "calibrate": (

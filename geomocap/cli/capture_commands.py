@@ -1,4 +1,4 @@
-"""Commands that make captures: synthesize, import, demo."""
+"""Commands that make captures: synthesize, import; convert calibrations."""
 
 from __future__ import annotations
 
@@ -15,19 +15,14 @@ from data_tools.importing import SizeMismatch, import_colmap, import_pose2sim
 from data_tools.importing_calibrations import Format, convert_calibration, import_calibration
 from data_tools.synthesize import SynthesisSettings
 from data_tools.synthesize import synthesize as synthesize_capture
-from geomocap import pipeline
-from geomocap.cli.arguments import CaptureFolder, MetresPerUnit, Where, Workers
+from geomocap.cli.arguments import CaptureFolder, MetresPerUnit, Workers
 from geomocap.cli.console import console
 from geomocap.cli.execution import executor_for
-from geomocap.cli.jobs import capture_job
 from geomocap.cli.progress_bars import progress_bars
-from geomocap.cli.reports import review_job, tell_results
 from geomocap.cli.settings_options import with_file_of_options, with_options_of
-from geomocap.config import Config
 from geomocap.settings import LEAST_FPS, MOST_FPS
 
 BUILT_IN: dict[str, Callable[[], AnimatedAsset]] = {"figure": figure, "mechanism": mechanism}
-DEMO = SynthesisSettings(cameras=8, width=320, height=240, fps=12, frames=24)
 
 
 @with_options_of(SynthesisSettings)
@@ -119,22 +114,6 @@ def convert(
     for note in rig.notes:
         console.print(f"note: {note}")
     console.print(f"{target}: {len(rig)} cameras")
-
-
-@with_file_of_options
-def demo(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for capture, truth and run.")] = Path("demo"),
-    workers: Workers = None,
-) -> None:
-    """Synthesize a small capture of the built-in figure and take it all the way to the report."""
-    capture, truth, run = out / "capture", out / "truth", out / "run"
-    with executor_for(workers, None) as executor, progress_bars() as progress:
-        if not (capture / "capture.toml").exists():
-            synthesize_capture(figure(), capture, truth, DEMO, executor=executor, progress=progress)
-    with capture_job(capture, run, Config(), Where(workers)) as job:
-        key = pipeline.motion_files(job, "voxels")
-        review_job(job, key)
-    tell_results(run)
 
 
 def open_asset(name: str, animation: str | None) -> AnimatedAsset:

@@ -99,8 +99,9 @@ def run(
     from geomocap import pipeline
     from geomocap.cli.jobs import capture_job
     from geomocap.cli.reports import review_job, tell_clouds, tell_results
+    from geomocap.kernels_ahead import kernels_compiled_ahead
 
-    with capture_job(capture, run, config, where, model, preview=preview) as job:
+    with kernels_compiled_ahead(where.workers), capture_job(capture, run, config, where, model, preview=preview) as job:
         key = pipeline.motion_files(job, source)
         if pictures:
             review_job(job, key)

@@ -83,15 +83,15 @@ def nearest_turn(M, R):
     for _ in range(30):  # 4 to 6 are enough
         done = True
         for p, q in ((0, 1), (0, 2), (1, 2)):
-            first, second, both = 0.0, 0.0, 0.0
+            own, other, both = 0.0, 0.0, 0.0
             for i in range(3):
-                first += U[i, p] * U[i, p]
-                second += U[i, q] * U[i, q]
+                own += U[i, p] * U[i, p]
+                other += U[i, q] * U[i, q]
                 both += U[i, p] * U[i, q]
-            if abs(both) <= 1e-15 * math.sqrt(first * second):
+            if abs(both) <= 1e-15 * math.sqrt(own * other):
                 continue
             done = False
-            ratio = (second - first) / (2.0 * both)
+            ratio = (other - own) / (2.0 * both)
             tangent = math.copysign(1.0, ratio) / (abs(ratio) + math.sqrt(1.0 + ratio * ratio))
             c = 1.0 / math.sqrt(1.0 + tangent * tangent)
             s = c * tangent
@@ -102,18 +102,28 @@ def nearest_turn(M, R):
             break
     for j in range(3):
         lengths[j] = U[0, j] * U[0, j] + U[1, j] * U[1, j] + U[2, j] * U[2, j]
-    order = np.argsort(-lengths)
+    # By hand: sorting an array, or assigning to a whole one, would take longer to compile than all the rest.
+    first, second, third = 0, 1, 2
+    if lengths[second] > lengths[first]:
+        first, second = second, first
+    if lengths[third] > lengths[second]:
+        second, third = third, second
+    if lengths[second] > lengths[first]:
+        first, second = second, first
     u, v = np.empty((3, 3)), np.empty((3, 3))
     for k in range(2):
+        column = second if k else first
         for i in range(3):
-            u[k, i], v[k, i] = U[i, order[k]], V[i, order[k]]
+            u[k, i], v[k, i] = U[i, column], V[i, column]
         if k:
             along = u[0, 0] * u[1, 0] + u[0, 1] * u[1, 1] + u[0, 2] * u[1, 2]
             for i in range(3):
                 u[1, i] -= along * u[0, i]
         length = math.sqrt(u[k, 0] * u[k, 0] + u[k, 1] * u[k, 1] + u[k, 2] * u[k, 2])
         if length == 0.0:
-            R[:] = np.eye(3)
+            for i in range(3):
+                for j in range(3):
+                    R[i, j] = 1.0 if i == j else 0.0
             return
         for i in range(3):
             u[k, i] /= length

@@ -74,11 +74,12 @@ def _search(value, allowed, other_groups, other_kinds, above, most):
         nodes += 1
         top -= 1
         total, count = totals[top], counts[top]
-        left[:] = stack[top]
+        for w in range(W):  # assigning whole arrays would take seconds more to compile
+            left[w] = stack[top, w]
         if total > greatest + 1e-12:
             greatest = total
-            best[:] = -1
-            best[:count] = taken[top, :count]
+            for i in range(N + 1):
+                best[i] = taken[top, i] if i < count else -1
         least = greatest + 1e-12
         if not _exceeds(least, total, left, other_groups, value, spare):
             continue
@@ -86,9 +87,11 @@ def _search(value, allowed, other_groups, other_kinds, above, most):
             continue
         first = _highest(left)
         stack[top, first >> 6] &= ~(np.uint64(1) << np.uint64(first & 63))
-        stack[top + 1] = left & allowed[first]
+        for w in range(W):
+            stack[top + 1, w] = left[w] & allowed[first, w]
         totals[top + 1] = total + value[first]
-        taken[top + 1, :count] = taken[top, :count]
+        for i in range(count):
+            taken[top + 1, i] = taken[top, i]
         taken[top + 1, count] = first
         counts[top + 1] = count + 1
         top += 2
@@ -101,7 +104,8 @@ def _exceeds(least, total, left, others, value, spare):
 
     `others` tells for each choice those of all other sets.
     """
-    spare[:] = left
+    for word in range(left.size):
+        spare[word] = left[word]
     for word in range(left.size - 1, -1, -1):
         while spare[word]:
             first = 64 * word + _highest_of(spare[word])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import threading
 
 import cv2
@@ -102,3 +104,11 @@ def test_a_rigid_motion_is_the_same_for_any_number_of_threads(rays):
         limit_threads(None)
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(("chosen", "used"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
+def test_matrices_are_multiplied_in_one_thread_unless_the_user_says_otherwise(chosen, used):
+    inherited = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+    words = "import os, geomocap; print(os.environ['OPENBLAS_NUM_THREADS'])"
+    told = subprocess.check_output([sys.executable, "-c", words], env=inherited | chosen, text=True)
+    assert told.strip() == used

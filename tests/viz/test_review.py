@@ -33,6 +33,7 @@ from viz.scene import stage
 from viz.sections import bodies_table, camera_remarks, cameras_table, changed_files
 from viz.sheets import overlay, path_sheet
 from viz.shown_names import named
+from viz.volumes import cubes
 
 
 @pytest.fixture(scope="session")
@@ -224,6 +225,21 @@ def test_overlay_lies_on_the_photographed_figure(made: Made) -> None:
     inside = mask > 0
     assert (painted & inside).sum() / (painted | inside).sum() > 0.8
     assert body_color(0) != (255, 0, 0)
+
+
+def test_bodies_look_alike_whether_or_not_the_volume_was_drawn_before(made: Made) -> None:
+    results, others = Results(made.run, made.capture), Results(made.run, made.capture)
+    volume, after, alone = scene.volume(results, 3), scene.bodies(results, 3), scene.bodies(others, 3)
+    assert after.outlined and not volume.outlined
+    assert (after.colors != volume.colors).any()
+    for field in ("vertices", "faces", "normals", "colors"):
+        np.testing.assert_array_equal(getattr(after, field), getattr(alone, field))
+    grid = results.voxels(3)
+    fewer, colors = grid.indices[::-2], grid.colors[::-2]
+    np.testing.assert_array_equal(
+        scene._cubes(results, 3, grid, fewer, colors).vertices,
+        cubes(fewer, grid.origin, grid.voxel_size, colors).vertices,
+    )
 
 
 def test_quality_of_the_figure(made: Made) -> None:

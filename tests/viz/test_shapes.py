@@ -71,6 +71,14 @@ def test_cubes_leave_out_shared_sides() -> None:
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1)
 
 
+def test_every_side_of_a_cube_has_the_colour_of_its_voxel() -> None:
+    block = np.argwhere(np.ones((2, 3, 4)))
+    mesh = cubes(block, np.zeros(3), 1.0, 10 * block.astype(np.uint8))
+    middles = mesh.vertices[mesh.faces].mean(axis=1)
+    sides = np.cross(*(mesh.vertices[mesh.faces[:, k]] - mesh.vertices[mesh.faces[:, 0]] for k in (1, 2)))
+    np.testing.assert_allclose(mesh.colors, 10 * np.floor(middles - 0.5 * sides) / 255)
+
+
 def test_gems_stand_on_their_points() -> None:
     points = np.random.default_rng(1).normal(size=(50, 3))
     mesh = gems(points, np.zeros((50, 3), np.uint8), 0.02)
