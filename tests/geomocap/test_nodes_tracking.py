@@ -11,13 +11,14 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
+from geomocap.nodes.coarse_motion import NEAR, CoarseTarget, State, mend
 from geomocap.nodes.correspondences import Target, gather_pulls, pull
 from geomocap.nodes.deformation import block_pattern, normal_equations, solve_blocks, step
 from geomocap.nodes.extremities import extremities, match_ends
 from geomocap.nodes.keyframes import most_open, openness
 from geomocap.nodes.node_graph import farthest_points, node_graph
 from geomocap.nodes.node_settings import NodeTrackingSettings
-from geomocap.nodes.node_tracking import track_nodes
+from geomocap.nodes.node_tracking import NodeModel, track_nodes
 from geomocap.nodes.surface_points import PointSet, point_set, surface_graph
 
 SMALL = NodeTrackingSettings(nodes=150, coarse_nodes=60, points=1200, coarse_points=800)
@@ -337,3 +338,34 @@ def test_each_face_of_a_box_is_turned_by_itself():
     known = p[:300] + 0.02
     turned = s.turned_like(known, outward[:300], 0.08).normals
     assert ((turned * outward).sum(axis=1) > 0).mean() > 0.98
+
+
+def four_legs(seed: int) -> np.ndarray:
+    """Points of a table with thin legs, 4,000."""
+    rng = np.random.default_rng(seed)
+    top = ellipsoid_of([0.6, 0.3, 0.1], 3000, rng)
+    leg = ellipsoid_of([0.04, 0.04, 0.3], 250, rng)
+    return np.concatenate([top, *(leg + [x, y, -0.35] for x in (-0.4, 0.4) for y in (-0.1, 0.1))])
+
+
+def ellipsoid_of(radii: list[float], count: int, rng: np.random.Generator) -> np.ndarray:
+    d = rng.normal(size=(count, 3))
+    return radii * d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def test_a_limb_that_was_taken_for_another_is_found_again_from_where_it_jumps():
+    settings = NodeTrackingSettings(nodes=300, coarse_nodes=150, points=2500, coarse_points=1500)
+    sets = [point_set(four_legs(k), 2500, 9) for k in range(8)]
+    model = NodeModel(sets[0], settings).coarse
+    frames = [CoarseTarget(Target(s, np.zeros(0), settings.normal_weight), np.zeros((0, 3))) for s in sets]
+    right = model.start()
+    leg = (model.graph.nodes[:, 2] < -0.15) & (model.graph.nodes[:, 0] > 0.2) & (model.graph.nodes[:, 1] > 0)
+    wrong = State(right.x - 0.2 * leg[:, None] * [0.0, 1.0, 0.0], right.R)
+    states = [model.fit(f, wrong if 2 <= k < 6 else right, NEAR[-1:], False) for k, f in enumerate(frames)]
+    assert all(np.abs(states[k].x[leg] - right.x[leg])[:, 1].mean() > 0.1 for k in range(2, 6))
+    # so little of the surface is unexplained that the frames seem to fit
+    assert states[3].cost < 1.3 * states[7].cost
+    for way in (-1, 1):
+        states = mend(model, frames, states, 0, way)
+    for state in states:
+        assert np.median(np.linalg.norm(state.x - right.x, axis=1)[leg]) < 0.5 * model.graph.spacing
