@@ -88,7 +88,7 @@ def test_images_show_the_turn_of_a_ball_that_geometry_cannot_see(views: list[Bal
     blind = track_nodes(ball_points, 4, settings)
     seeing = track_nodes(ball_points, 4, settings, images=lambda k: views[k])
     assert abs(turned_about_z(blind.positions)) < 0.5 * 3 * TURN_DEG
-    # windows are 7 pixels of 12.5 mm: a hundredth of a pixel would be 0.01°; held by a rough surface, a tenth is asked
+    # windows are 5 pixels of 12.5 mm: a hundredth of a pixel would be 0.01°; held by a rough surface, a tenth is asked
     assert turned_about_z(seeing.positions) == pytest.approx(3 * TURN_DEG, abs=0.6)
 
 

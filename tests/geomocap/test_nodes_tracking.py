@@ -345,7 +345,7 @@ def four_legs(seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     top = ellipsoid_of([0.6, 0.3, 0.1], 3000, rng)
     leg = ellipsoid_of([0.04, 0.04, 0.3], 250, rng)
-    return np.concatenate([top, *(leg + [x, y, -0.35] for x in (-0.4, 0.4) for y in (-0.1, 0.1))])
+    return np.concatenate([top, *(leg + np.array([x, y, -0.35]) for x in (-0.4, 0.4) for y in (-0.1, 0.1))])
 
 
 def ellipsoid_of(radii: list[float], count: int, rng: np.random.Generator) -> np.ndarray:
