@@ -14,13 +14,15 @@ from geomocap.nodes.deformation import BlockPattern, block_pattern, step
 from geomocap.nodes.extremities import match_ends
 from geomocap.nodes.node_graph import NodeGraph
 from geomocap.nodes.node_settings import NodeTrackingSettings
-from geomocap.nodes.surface_coverage import SMALLEST_PIECE
+from geomocap.nodes.surface_coverage import limbs_apart
 
 # Distance at which correspondences lose their weight (node spacings) and stiffness, step by step.
 _SETTLE = ((0.8, 2.0), (0.8, 1.0), (0.8, 1.0), (0.6, 1.0), (0.6, 1.0), (0.6, 1.0), (0.4, 1.0), (0.4, 1.0), (0.3, 1.0))
 NEAR = ((0.8, 8.0), (0.8, 4.0), *_SETTLE)
 FAR = ((2.0, 8.0), (1.5, 8.0), (1.2, 4.0), *_SETTLE)
-_AWAY = 0.5  # node spacings; limbs of a galloping stag were off by two and more where they were lost
+# Node spacings from halfway between the neighbours in time, where a limb is that jumps by one spacing. Legs of a
+# galloping stag that were lost jumped by two and more. No other value was tried.
+_AWAY = 0.5
 _BAD = 1.3  # cost from which a frame is tried again, relative to the median
 
 
@@ -118,11 +120,6 @@ class CoarseModel:
         """Cost of a state, and of being elsewhere than expected: limbs that seem to have changed places have not."""
         away = np.linalg.norm(state.x - expected.x, axis=1) / (2 * self.graph.spacing)
         return state.cost + self.settings.inertia_cost * float((np.minimum(away, 1.0) ** 2).mean())
-
-    def limb_away(self, state: State, expected: State) -> bool:
-        """Whether as much of the surface as the smallest limb is clearly elsewhere than expected."""
-        away = np.linalg.norm(state.x - expected.x, axis=1) > _AWAY * self.graph.spacing
-        return bool(away.mean() >= SMALLEST_PIECE)
 
     def between(self, last: State, following: State) -> State:
         """Halfway between two states, made as rigid as can be."""
@@ -244,8 +241,8 @@ def mend(model: CoarseModel, frames: list[CoarseTarget], states: list[State], re
     usual = float(np.median([model.cost(s, b) for s, b in zip(states[1:-1], between, strict=True)]))
     for t in range(1, T - 1) if way > 0 else range(T - 2, 0, -1):
         middle = model.between(states[t - 1], states[t + 1])
-        fits = model.cost(states[t], middle) < _BAD * usual and not model.limb_away(states[t], middle)
-        if t == reference or fits:
+        jumps = limbs_apart(states[t].x, middle.x, _AWAY * model.graph.spacing).any()
+        if t == reference or (model.cost(states[t], middle) < _BAD * usual and not jumps):
             continue
         frame = model.sided(frames[t], middle)
         tried = [model.fit(frame, start, NEAR, False) for start in (middle, states[t + 1], states[t - 1])]

@@ -19,7 +19,7 @@ from geomocap.nodes.correspondences import Target, pull
 from geomocap.nodes.deformation import BlockPattern, step
 from geomocap.nodes.image_pull import HALF, LEAST_COSINE, FrameImages, window_pulls
 from geomocap.nodes.node_graph import NodeGraph
-from geomocap.nodes.surface_coverage import SMALLEST_PIECE
+from geomocap.nodes.surface_coverage import limbs_apart
 
 EARLIER = (1, 4, 16)
 """Frames before the present one that its images are compared with, besides the reference frame."""
@@ -174,8 +174,7 @@ class ImageMotion:
 
     def _apart(self, one: NodeState, other: NodeState) -> np.ndarray:
         """Nodes that are clearly elsewhere in two states, (N,) bool; none if they are fewer than the smallest limb."""
-        apart = np.linalg.norm(one[0] - other[0], axis=1) > _APART * self.graph.spacing
-        return apart & (apart.mean() >= SMALLEST_PIECE)
+        return limbs_apart(one[0], other[0], _APART * self.graph.spacing)
 
     def _better(self, frame: Target, found: list[tuple[NodeState, np.ndarray]]) -> int:
         """Return which state leaves least of the points and of the images unexplained and is strained least.

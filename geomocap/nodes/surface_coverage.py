@@ -76,3 +76,12 @@ def left_over(samples: np.ndarray, paths: np.ndarray, reach: float) -> np.ndarra
         rows = np.flatnonzero(there[:, k])
         alone[rows] += uncovered(samples[rows, k], paths[:, k], reach)
     return 2 * alone > there.sum(axis=1)
+
+
+def limbs_apart(one: np.ndarray, other: np.ndarray, distance: float) -> np.ndarray:
+    """Find which nodes (N, 3) are farther than `distance` from their other places (N, 3): (N,) bool.
+
+    None if they are fewer than the smallest piece has: so few are no limb.
+    """
+    apart = np.asarray(np.linalg.norm(one - other, axis=1) > distance)
+    return apart & (apart.mean() >= SMALLEST_PIECE)
