@@ -19,8 +19,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 
 from geomocap.bodies.body_model import BodyModel, Evidence
 from geomocap.bodies.rigid_motions import relative_turn
@@ -57,7 +55,7 @@ class Criterion:
     noise : SurfaceNoise
         blends of its neighbours miss its samples by more than this noise and its freedoms are worth;
     min_fraction : float
-        it has at least this fraction of the samples.
+        of fewer samples than this fraction, it needs as much more evidence.
     softness : float
         Soft skin differs from a blend of two bodies by up to this fraction of how far these carry it apart.
     """
@@ -105,8 +103,8 @@ def judge(
 ) -> dict[int, Candidate]:
     """What speaks for some bodies, by their number.
 
-    A body of too few samples goes, unless others hang together by it alone, as foot and trunk do by a leg that few
-    samples are on; its evidence must be greater by as much as it is too small.
+    The evidence of a body of few samples must be greater by as much as it is too small: limbs are often followed by
+    few, and noise is no limb.
 
     Parameters
     ----------
@@ -144,10 +142,7 @@ def _judge(
     turn = float(np.sqrt(max(min(turns) ** 2 - feigned, 0.0)))
     by_turn, into = turn / criterion.min_turn, int(neighbours[int(np.argmin(turns))])
     size = float(evidence.counts[members].sum()) / max(criterion.min_fraction * len(model.label), 1e-12)
-    if size < 1.0:
-        by_evidence *= size
-        if not _connects(body, neighbours, contacts):
-            return Candidate(body, min(0.5 * size, by_evidence, by_turn), into, turn, by_evidence)
+    by_evidence *= min(size, 1.0)
     return Candidate(body, min(by_evidence, by_turn), into if by_turn < by_evidence else -1, turn, by_evidence)
 
 
@@ -252,11 +247,3 @@ def _seen(body: int, model: BodyModel, evidence: Evidence) -> np.ndarray:
     """Frames in which enough samples of a body are seen to know its motion, (T,) bool."""
     seen = evidence.seen[model.label == body]
     return seen.sum(axis=0) >= max(_LEAST_SAMPLES, _LEAST_SEEN * len(seen))
-
-
-def _connects(body: int, neighbours: np.ndarray, contacts: np.ndarray) -> bool:
-    """Whether the bodies beside it hang together by this one only."""
-    touching = contacts >= _LEAST_CONTACTS
-    touching[body] = touching[:, body] = False
-    part = connected_components(csr_matrix(touching), directed=False)[1]
-    return len(np.unique(part[neighbours])) > 1

@@ -48,8 +48,8 @@ class MotionBodiesSettings(Settings):
         default=0.01,
         ge=0,
         lt=0.5,
-        description="smallest body (fraction of the samples; what one camera alone sees counts two thirds), unless "
-        "two others hang together by it",
+        description="bodies of fewer samples need as much more evidence (fraction of the samples; what one camera "
+        "alone sees counts two thirds)",
         json_schema_extra={"flag": "min-fraction"},
     )
     soft_fraction: float = Field(
