@@ -19,6 +19,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
 from geomocap.bodies.body_model import BodyModel, Evidence
 from geomocap.bodies.rigid_motions import relative_turn
@@ -104,7 +106,8 @@ def judge(
     """What speaks for some bodies, by their number.
 
     The evidence of a body of few samples must be greater by as much as it is too small: limbs are often followed by
-    few, and noise is no limb.
+    few, and noise is no limb. Where single cameras follow the surface it goes, unless others hang together by it alone,
+    as foot and trunk do by a leg that few samples are on.
 
     Parameters
     ----------
@@ -143,6 +146,10 @@ def _judge(
     by_turn, into = turn / criterion.min_turn, int(neighbours[int(np.argmin(turns))])
     size = float(evidence.counts[members].sum()) / max(criterion.min_fraction * len(model.label), 1e-12)
     by_evidence *= min(size, 1.0)
+    # what single cameras follow may stand off the surface: with the rule above alone a real recording before four
+    # cameras had 16 bodies instead of 13, and joints that were 13 mm worse
+    if evidence.ray is not None and size < 1.0 and not _connects(body, neighbours, contacts):
+        return Candidate(body, min(0.5 * size, by_evidence, by_turn), into, turn, by_evidence)
     return Candidate(body, min(by_evidence, by_turn), into if by_turn < by_evidence else -1, turn, by_evidence)
 
 
@@ -247,3 +254,11 @@ def _seen(body: int, model: BodyModel, evidence: Evidence) -> np.ndarray:
     """Frames in which enough samples of a body are seen to know its motion, (T,) bool."""
     seen = evidence.seen[model.label == body]
     return seen.sum(axis=0) >= max(_LEAST_SAMPLES, _LEAST_SEEN * len(seen))
+
+
+def _connects(body: int, neighbours: np.ndarray, contacts: np.ndarray) -> bool:
+    """Whether the bodies beside it hang together by this one only."""
+    touching = contacts >= _LEAST_CONTACTS
+    touching[body] = touching[:, body] = False
+    part = connected_components(csr_matrix(touching), directed=False)[1]
+    return len(np.unique(part[neighbours])) > 1
