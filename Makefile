@@ -24,8 +24,9 @@ test: lint
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(SIDE_BY_SIDE)
 
 test-fast: .stamps/dev
-	$(BIN)/python -m pytest -m "not slow" $(ALONE)
-	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" $(SIDE_BY_SIDE)
+	$(BIN)/python -m pytest -m "not slow" $(ALONE) $(if $(REPORTS),--junitxml=$(REPORTS)/alone.xml)
+	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 \
+		$(BIN)/python -m pytest -m "not slow" $(SIDE_BY_SIDE) $(if $(REPORTS),--junitxml=$(REPORTS)/rest.xml)
 
 lint: .stamps/dev
 	$(BIN)/ruff check .

@@ -107,10 +107,7 @@ class Ran:
     gate: Gate
 
 
-SLOW = [name for name, case in CASES.items() if case.make is not perfect_tracks]
-
-
-@pytest.fixture(scope="module", params=[pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in CASES])
+@pytest.fixture(scope="module", params=list(CASES))
 def ran(request, geomocap, tmp_path_factory) -> Ran:
     case, folder = CASES[request.param], tmp_path_factory.mktemp("accuracy")
     return Ran(run(case, folder, geomocap), folder / "truth", case.gate)

@@ -151,7 +151,6 @@ def test_the_changelog_knows_the_version():
     assert version in versions[:2]
 
 
-@pytest.mark.slow
 def test_pages_build_and_fetch_nothing(tmp_path):
     pytest.importorskip("mkdocs", reason="the pages want the extra docs")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]

@@ -34,7 +34,6 @@ def test_every_example_is_tested_and_short():
         assert len(file.read_text().splitlines()) <= 60, file
 
 
-@pytest.mark.slow
 def test_a_capture_to_a_skeleton(tmp_path, monkeypatch, capsys):
     settings = SynthesisSettings(cameras=4, width=160, height=120, fps=10, frames=6)
     synthesize(figure(), tmp_path / "capture", tmp_path / "truth", settings)
@@ -68,7 +67,6 @@ def test_any_scans_to_bodies(tmp_path, monkeypatch, capsys):
     assert same_partition(labels["frame_000000"], truth.body)
 
 
-@pytest.mark.slow
 def test_a_calibration_by_bar(tmp_path, monkeypatch, capsys):
     settings = SynthesisSettings(
         cameras=4, width=320, height=240, fps=10, frames=1, bar=40, withhold_calibration=True, distortion=0.0

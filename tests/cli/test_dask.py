@@ -31,7 +31,6 @@ def scheduler():
         process.stdin.write("\n")
 
 
-@pytest.mark.slow
 def test_cluster_gives_the_same_files(small_capture, geomocap, scheduler, tmp_path):
     geomocap("voxels", small_capture, tmp_path / "threads", *SETTINGS)
     arguments = ["run", small_capture, tmp_path / "dask", *QUICK, "--no-pictures", "--scheduler", scheduler]

@@ -74,7 +74,6 @@ def test_nothing_is_done_twice(finished, small_capture, geomocap):
     assert {p: p.stat().st_mtime_ns for p in finished.rglob("*.ply")} == before
 
 
-@pytest.mark.slow
 def test_a_run_killed_again_and_again_goes_on_and_ends_with_the_same_files(finished, small_capture, geomocap, tmp_path):
     run = tmp_path / "run"
     command = [sys.executable, "-m", "geomocap", "run", str(small_capture), str(run), *QUICK, "--no-pictures"]

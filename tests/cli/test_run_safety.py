@@ -112,7 +112,6 @@ def test_export_by_command_is_taken_as_the_run_s_own(run, tiny, geomocap):
     assert (run / "motion.bvh").read_bytes() == written
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("fraction", [0.05, 0.25, 0.5, 0.75, 0.95])
 def test_a_disk_that_becomes_full_and_then_has_room(whole, tiny, tmp_path, fraction):
     kilobytes = sum(-(-p.stat().st_size // 4096) * 4 for p in whole.rglob("*") if p.is_file())
@@ -125,7 +124,6 @@ def test_a_disk_that_becomes_full_and_then_has_room(whole, tiny, tmp_path, fract
         assert digests(disk / "run") == digests(whole)
 
 
-@pytest.mark.slow
 def test_killed_at_random_moments(whole, tiny, tmp_path):
     chance, context = random.Random(1), killed.prepared()
     for k in range(3):
@@ -133,7 +131,6 @@ def test_killed_at_random_moments(whole, tiny, tmp_path):
         assert not wrong
 
 
-@pytest.mark.slow
 def test_many_runs_in_one_process_hold_no_more(tmp_path):
     held = list(soak.soak(10, tmp_path))
     assert len({(h.files, h.threads) for h in held[4:]}) == 1

@@ -201,7 +201,6 @@ def test_colmap_project_becomes_a_capture(tmp_path: Path) -> None:
         import_colmap(tmp_path / "project", tmp_path / "c3", 12.5, metres_per_unit=-1)
 
 
-@pytest.mark.slow
 def test_real_session_is_letterboxed_in_two_cameras(data: Path, tmp_path: Path) -> None:
     report = import_pose2sim(data / "captures" / "pose2sim_single", tmp_path / "c", plates=False)
     assert (report.capture.n_frames, report.capture.fps) == (100, 60)

@@ -4,8 +4,6 @@ import os
 import subprocess
 import sys
 
-import pytest
-
 TRACKING = """
 from geomocap.patches.patch_tracking import track_surface
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
@@ -22,7 +20,6 @@ found = match_pairs(pair(*images), grid(), warped(grid()).round())
 PRINT = "import hashlib; print(hashlib.sha256(found.positions.tobytes()).hexdigest())\n"
 
 
-@pytest.mark.slow
 def test_compiling_changes_no_bit(tmp_path) -> None:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-c", TRACKING + PRINT + MATCHING + PRINT]

@@ -74,7 +74,6 @@ def check_answered(answer: Path, done: subprocess.CompletedProcess[str]) -> None
     assert answer.is_file(), said
 
 
-@pytest.mark.slow
 def test_a_run_is_imported_as_it_is(tmp_path: Path) -> None:
     command = blender()
     made = make(tmp_path)
@@ -111,7 +110,6 @@ def test_a_run_is_imported_as_it_is(tmp_path: Path) -> None:
         assert told["source"] == "SEQUENCE" and told["image"].endswith(f"{name}/000000.png")
 
 
-@pytest.mark.slow
 def test_folders_that_are_no_runs_are_told(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(

@@ -7,7 +7,6 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from geomocap.export.export_settings import ExportSettings
 from geomocap.export.run_export import export_run
@@ -94,7 +93,6 @@ def retargeted(glb: Path, tmp_path: Path) -> dict:
     return json.loads(answer.read_text())
 
 
-@pytest.mark.slow
 def test_bones_of_another_person_point_where_the_subjects_do(tmp_path: Path) -> None:
     skeleton, _ = figure(read_template("human"), turn=0.7, speed=0.5)
     run = Run(tmp_path / "run")

@@ -248,7 +248,6 @@ class User:
         return self.editor.session.file.names
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # those of the browser's driver are not ours
 def test_place_move_rename_delete_undo_save_reload(scene):
     toml = scene.run.path / "keypoints.toml"

@@ -191,7 +191,6 @@ def change(page: Page, label: str, value: Any) -> None:
     page.run(script.format(json.dumps(value), json.dumps(event), label))
 
 
-@pytest.mark.slow
 def test_the_subject_is_drawn_turned_played_and_taken_apart(page_file):
     with chromium() as page:
         page.show(1000, 900)
@@ -260,7 +259,6 @@ def test_the_subject_is_drawn_turned_played_and_taken_apart(page_file):
         assert page.run("document.querySelectorAll('img[onerror], main img[src=x]').length") == 0
 
 
-@pytest.mark.slow
 def test_telephones_and_dark_rooms(page_file):
     with chromium() as page:
         bright = {}
@@ -276,7 +274,6 @@ def test_telephones_and_dark_rooms(page_file):
         assert page.complaints == []
 
 
-@pytest.mark.slow
 def test_a_picture_stands_where_webgl_is_missing(page_file):
     with chromium("--disable-3d-apis") as page:
         page.show(800, 700)

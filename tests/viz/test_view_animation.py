@@ -83,7 +83,6 @@ def test_recordings_hold_the_surface(tmp_path):
     assert (tmp_path / "with.rrd").stat().st_size > (tmp_path / "without.rrd").stat().st_size
 
 
-@pytest.mark.slow
 def test_the_surface_moves_in_the_browser(made, tmp_path):
     export_run(made.run, ["glb"], folder=tmp_path)
     content = of_animation("motion.glb", load_gltf(tmp_path / "motion.glb"))

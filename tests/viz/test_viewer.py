@@ -245,7 +245,6 @@ def test_without_rerun_the_line_says_what_to_install(made, tmp_path, monkeypatch
 # --- the page in a browser ---
 
 
-@pytest.mark.slow
 def test_two_runs_play_side_by_side_and_bodies_are_renamed_by_a_click(made, run):
     contents = of_run(Results(run, made.capture)), of_run(Results(made.run))
     with served(*contents) as viewer, chromium() as page:
