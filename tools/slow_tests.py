@@ -1,7 +1,7 @@
 """Write the list of tests that `make test-fast` leaves out, `tests/slow_tests.txt`.
 
     python -m tools.slow_tests          add those that have become slow since
-    python -m tools.slow_tests --anew   measure all of them, which takes as long as `make test`
+    python -m tools.slow_tests --anew   measure all of them, which takes longer than `make test`
 
 The tests run as `make test-fast` runs them, again and again until none that is left takes longer than the limit: what a
 test leaves behind for others of its file, as a run that they look at, is made by the next of them.
