@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -56,7 +57,7 @@ class MotionPaths:
         if not np.isfinite(self.positions).all(axis=2).any(axis=1).all():
             raise GeometryError("motion paths: a sample without any position; leave such samples out")
 
-    @property
+    @cached_property
     def seen(self) -> np.ndarray:
         """Where a sample has a position, (N, T) bool."""
         return np.isfinite(self.positions).all(axis=2)

@@ -189,6 +189,15 @@ class Rig:
             cameras.append(small)
         return Rig(self.names, tuple(cameras), np.array(self.cam_from_world))
 
+    def shrunk(self, factor: int) -> Rig:
+        """Return the rig with images reduced by a whole factor; sizes that it doesn't divide are rounded up."""
+        cameras = []
+        for camera in self.cameras:
+            small = pycolmap.Camera(camera.todict())
+            small.rescale(-(-camera.width // factor), -(-camera.height // factor))
+            cameras.append(small)
+        return Rig(self.names, tuple(cameras), np.array(self.cam_from_world))
+
     def undistorted(self) -> Rig:
         """Return the rig of pinhole cameras that see at least all that the real cameras see.
 

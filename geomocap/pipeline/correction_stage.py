@@ -81,8 +81,7 @@ def _cut_alone(job: Job, capture: Capture, frames: list[int], shrink: int) -> li
     look = _Look(LearnBackground(capture, settings, shrink), tuple(sorted({*frames, *learning})))
     looks = list(map_items(look, capture.cameras, job.executor, "cameras", job.progress, 2))
     models = [model for model, _ in looks]
-    if shrink == 1:
-        job.backgrounds.update(zip(capture.cameras, models, strict=True))
+    job.backgrounds.update(((c, shrink), model) for c, model in zip(capture.cameras, models, strict=True))
 
     def moments(numbers: list[int]) -> list[_Moment]:
         return [_Moment(k, tuple(known.get(k) for _, known in looks)) for k in numbers]
@@ -94,7 +93,7 @@ def _cut_alone(job: Job, capture: Capture, frames: list[int], shrink: int) -> li
     return list(map_items(_CutReduced(read, scene), moments(frames), job.executor, "cameras", job.progress, 4))
 
 
-def _reduced(image: np.ndarray, shrink: int) -> np.ndarray:
+def reduced(image: np.ndarray, shrink: int) -> np.ndarray:
     """Reduce an image by a whole factor; a size that it doesn't divide is rounded up."""
     h, w = image.shape[:2]
     size = -(-w // shrink), -(-h // shrink)
@@ -118,7 +117,7 @@ class _ReadReduced:
 
     def __call__(self, moment: _Moment) -> list[np.ndarray]:
         return [
-            _reduced(self.capture.frame(c, moment.frame), self.shrink) if image is None else image
+            reduced(self.capture.frame(c, moment.frame), self.shrink) if image is None else image
             for c, image in zip(self.capture.cameras, moment.images, strict=True)
         ]
 
@@ -141,13 +140,13 @@ class LearnBackground:
 
     def read(self, camera: str, number: int) -> np.ndarray:
         """Read a frame of the recording, reduced."""
-        return _reduced(self.capture.sources[camera].read(number), self.shrink)
+        return reduced(self.capture.sources[camera].read(number), self.shrink)
 
     def learnt(self, camera: str, frames: list[np.ndarray]) -> BackgroundModel:
         """Learn it from these frames, reduced."""
         if not self.capture.has_background(camera):
             return model_from_frames(frames, self.settings, camera)
-        plate = _reduced(self.capture.background(camera), self.shrink)
+        plate = reduced(self.capture.background(camera), self.shrink)
         if self.shrink > 1:
             plate[..., 3] = np.where(plate[..., 3] == 255, 255, 0)  # a pixel is known if all that it covers is
         return model_from_plate(plate, frames, self.settings, camera)

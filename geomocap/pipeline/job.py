@@ -49,9 +49,9 @@ class Job:
         `model.npz` of the subject, from another sequence.
     tell : callable
         Told in a line what the user should know.
-    backgrounds : dict of str to BackgroundModel
-        Of cameras whose images are so small that the correction of the cameras learnt them as silhouettes need them;
-        these take them out again.
+    backgrounds : dict of (str, int) to BackgroundModel
+        By camera and the factor by which images were reduced: those that the correction of the cameras learnt, for the
+        silhouettes, which take them out again.
     """
 
     run: Run
@@ -63,7 +63,7 @@ class Job:
     fps: float = 30.0
     model: Path | None = None
     tell: Callable[[str], object] = _say_nothing
-    backgrounds: dict[str, BackgroundModel] = field(default_factory=dict, repr=False, compare=False)
+    backgrounds: dict[tuple[str, int], BackgroundModel] = field(default_factory=dict, repr=False, compare=False)
 
     def stage(
         self,

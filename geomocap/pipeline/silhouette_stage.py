@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from geomocap.errors import CaptureError
@@ -12,12 +13,17 @@ from geomocap.evaluation.camera_check import BACKGROUND_FRAMES
 from geomocap.files.capture import Capture
 from geomocap.files.images import write_mask
 from geomocap.files.run import Run, stage_key
-from geomocap.pipeline.correction_stage import LearnBackground, with_cameras
+from geomocap.model.rig import Rig
+from geomocap.pipeline.correction_stage import LearnBackground, reduced, with_cameras
 from geomocap.pipeline.job import Job
 from geomocap.scheduling import map_items
 from geomocap.silhouettes.likelihood import Counts
 from geomocap.silhouettes.region import region_of_points
 from geomocap.silhouettes.silhouette_scene import SilhouetteScene, learning_frames
+
+LONGEST = 960
+"""Longer side of the images that are decided on, pixels, about: larger ones are reduced by a whole factor. A voxel of
+the default grid is some 3 pixels of these where the subject fills the image."""
 
 
 def silhouettes(job: Job) -> str:
@@ -51,26 +57,28 @@ def _make_silhouettes(job: Job, capture: Capture) -> int:
                 f"{capture.n_recorded} frames without background pictures of {', '.join(lacking)} hardly show what the "
                 "background is; add background/<camera>.png"
             )
-        task = _Cut(capture, job.run, learn_scene(job, capture))
+        shrink = _shrink(capture)
+        task = _Cut(capture, job.run, shrink, learn_scene(job, capture, shrink))
     for k, _ in zip(missing, map_items(task, missing, job.executor, "silhouettes", job.progress, 4), strict=True):
         job.run.note("silhouettes", files[k])
     return len(missing) * len(capture.cameras)
 
 
-def learn_scene(job: Job, capture: Capture) -> SilhouetteScene:
-    """Learn what the cameras see without the subject, and how subject and background differ."""
+def learn_scene(job: Job, capture: Capture, shrink: int) -> SilhouetteScene:
+    """Learn what the cameras see without the subject, and how both differ, in images reduced by a whole factor."""
     settings = job.config.silhouettes
-    known = {c: job.backgrounds.pop(c) for c in capture.cameras if c in job.backgrounds}
+    known = {c: job.backgrounds[c, shrink] for c in capture.cameras if (c, shrink) in job.backgrounds}
+    job.backgrounds.clear()
     missing = [c for c in capture.cameras if c not in known]
     if missing:
-        learn = LearnBackground(capture, settings)
+        learn = LearnBackground(capture, settings, shrink)
         known |= zip(missing, map_items(learn, missing, job.executor, "background", job.progress, 2), strict=True)
     models = [known[c] for c in capture.cameras]
-    regions = _regions(capture)
-    rig = capture.rig if capture.is_calibrated else None
+    rig = capture.rig.shrunk(shrink) if capture.is_calibrated else None
+    regions = _regions(capture, rig)
     scene = SilhouetteScene.unlearnt(models, rig, settings, [regions.get(c) for c in capture.cameras])
     some = learning_frames(capture.n_frames)
-    return scene.learnt(map_items(_Count(capture, scene), some, job.executor, "likelihood", job.progress, 4))
+    return scene.learnt(map_items(_Count(capture, shrink, scene), some, job.executor, "likelihood", job.progress, 4))
 
 
 @dataclass(frozen=True)
@@ -78,10 +86,11 @@ class _Count:
     """What the images of one frame tell about subject and background."""
 
     capture: Capture
+    shrink: int
     scene: SilhouetteScene
 
     def __call__(self, frame: int) -> Counts:
-        return self.scene.count([self.capture.frame(c, frame) for c in self.capture.cameras])
+        return self.scene.count(_read(self.capture, frame, self.shrink))
 
 
 @dataclass(frozen=True)
@@ -90,13 +99,15 @@ class _Cut:
 
     capture: Capture
     run: Run
+    shrink: int
     scene: SilhouetteScene
 
     def __call__(self, frame: int) -> None:
-        cameras = self.capture.cameras
-        masks = self.scene.silhouettes([self.capture.frame(c, frame) for c in cameras])
-        for camera, mask in zip(cameras, masks, strict=True):
-            write_mask(self.run.silhouette_file(camera, frame), mask * np.uint8(255))
+        capture = self.capture
+        masks = self.scene.silhouettes(_read(capture, frame, self.shrink))
+        for camera, mask in zip(capture.cameras, masks, strict=True):
+            full = _enlarged(mask * np.uint8(255), capture.sources[camera].size)
+            write_mask(self.run.silhouette_file(camera, frame), full)
 
 
 @dataclass(frozen=True)
@@ -111,14 +122,30 @@ class _Copy:
             write_mask(self.run.silhouette_file(camera, frame), self.capture.mask(camera, frame))
 
 
-def _regions(capture: Capture) -> dict[str, np.ndarray]:
-    """Images of the capture's region of interest, (H, W) bool by camera; nothing where there is none."""
+def _shrink(capture: Capture) -> int:
+    """Factor by which all images are reduced."""
+    return max(1, round(max(max(capture.sources[c].size) for c in capture.cameras) / LONGEST))
+
+
+def _read(capture: Capture, frame: int, shrink: int) -> list[np.ndarray]:
+    """Images of one frame, reduced."""
+    return [reduced(capture.frame(c, frame), shrink) for c in capture.cameras]
+
+
+def _enlarged(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Bring a mask of a reduced image to the image's size (width, height), with smooth outlines."""
+    if mask.shape == size[::-1]:
+        return mask
+    return np.where(cv2.resize(mask, size, interpolation=cv2.INTER_LINEAR) > 127, np.uint8(255), np.uint8(0))
+
+
+def _regions(capture: Capture, rig: Rig | None) -> dict[str, np.ndarray]:
+    """Where the region of interest lies in the images of a rig, (H, W) bool by camera; nothing without one."""
     box = capture.info.region_of_interest
-    if box is None or not capture.is_calibrated:
+    if box is None or rig is None:
         return {}
     corners = np.stack(np.meshgrid(*np.transpose(box), indexing="ij"), axis=-1).reshape(-1, 3)
-    pixels = capture.rig.project(corners)
-    sizes = capture.rig.sizes
+    pixels, sizes = rig.project(corners), rig.sizes
     return {
         name: region_of_points(pixels[c], (int(sizes[c, 0]), int(sizes[c, 1])))
         for c, name in enumerate(capture.cameras)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numba import njit
-from scipy.ndimage import maximum
 
 COHERENCE = 3.0  # log odds that each pixel of border between subject and background costs
 SMALLEST_RELATIVE = 0.02  # of the largest piece: smaller ones go
@@ -59,7 +58,7 @@ def clean(
     keep = (areas >= least) & (total > cost * border)
     keep[0] = False
     if words is not None:
-        keep[1:] &= maximum(words[part], labels, np.arange(1, count)) >= 0.0
+        keep &= said_of(labels, np.ascontiguousarray(words[part]), count)
     result = np.zeros_like(mask)
     result[part] = keep[labels]
     return result
@@ -93,3 +92,15 @@ def region_sums(labels, evidence, count):
                 border[k] += 1
                 border[labels[y + 1, x]] += 1
     return total, border
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def said_of(labels, words, count):
+    """Whether the other cameras say of any pixel of a labelled region that it may be subject, (count,) bool."""
+    h, w = labels.shape
+    result = np.zeros(count, np.bool_)
+    for y in range(h):
+        for x in range(w):
+            if words[y, x] >= 0.0:
+                result[labels[y, x]] = True
+    return result

@@ -183,3 +183,17 @@ def test_labels_are_no_masks():
     assert labels_of(cv2.GaussianBlur(mask, (5, 5), 0)) == []
     mask[12:28, 12:20] = 1
     assert labels_of(mask) == [0, 1, 255]
+
+
+def test_large_images_are_decided_reduced_and_silhouettes_have_their_size(capture, tmp_path, monkeypatch):
+    silhouettes(job_of(capture, tmp_path / "full", "warn"))
+    monkeypatch.setattr("geomocap.pipeline.silhouette_stage.LONGEST", max(SIZE) // 2)
+    job = job_of(capture, tmp_path / "reduced", "warn")
+    silhouettes(job)
+    assert not job.backgrounds
+    for file in (tmp_path / "full" / "silhouettes").rglob("*.png"):
+        full = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        found = cv2.imread(str(tmp_path / "reduced" / file.relative_to(tmp_path / "full")), cv2.IMREAD_UNCHANGED)
+        assert found.shape == full.shape and set(np.unique(found)) == {0, 255}
+        both, either = ((full > 0) & (found > 0)).sum(), ((full > 0) | (found > 0)).sum()
+        assert 0.75 < both / either < 1.0, file  # limbs are three pixels wide

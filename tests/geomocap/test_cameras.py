@@ -64,6 +64,16 @@ def test_points_behind_a_camera_have_no_pixel():
     assert np.isnan(rig.project(behind[None])).all()
 
 
+@pytest.mark.parametrize("factor", [2, 7])  # 320 × 240: 7 doesn't divide it
+def test_shrunk_images_show_points_at_the_same_fraction_of_their_size(factor):
+    rig = make_rig(3)
+    small = rig.shrunk(factor)
+    np.testing.assert_array_equal(small.sizes, np.ceil(rig.sizes / factor))
+    points = np.array([[0.15, -0.1, 0.2], [0.0, 0.3, -0.2]])
+    where = rig.project(points) / rig.sizes[:, None]
+    np.testing.assert_allclose(small.project(points) / small.sizes[:, None], where, atol=1e-9)
+
+
 def test_undistorted_image_shows_what_the_pinhole_camera_sees():
     rig = make_rig(3)
     flat = rig.undistorted()

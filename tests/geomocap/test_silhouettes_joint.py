@@ -11,6 +11,7 @@ import numpy as np
 import open3d as o3d
 import pycolmap
 import pytest
+from scipy.ndimage import maximum
 
 from geomocap.model.rig import Rig
 from geomocap.silhouettes.background import BackgroundModel, model_from_plate
@@ -18,7 +19,7 @@ from geomocap.silhouettes.colors import LEVEL, LEVELS, color_density, count_colo
 from geomocap.silhouettes.joint_decision import CameraEvidence, Decision, decide, learn_from
 from geomocap.silhouettes.likelihood import BINS, CLASSES, QUARTERS, Likelihood, log_odds, misfit_density, shared_noise
 from geomocap.silhouettes.other_cameras import NOWHERE, STEPS, OtherCameras, best_on_rays, gather, say
-from geomocap.silhouettes.pieces import clean
+from geomocap.silhouettes.pieces import clean, said_of
 from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 SETTINGS = SilhouetteSettings()
@@ -340,3 +341,13 @@ def test_a_piece_that_the_others_deny_everywhere_goes() -> None:
     assert together[10:50, 10:30].all() and together.sum() == 40 * 20
     words[25:30, 55:60] = 0.0  # nobody else sees this
     np.testing.assert_array_equal(clean(mask, odds, 1.0, 1e-4, words), mask)
+
+
+def test_what_others_say_of_regions_is_their_largest_word():
+    rng = np.random.default_rng(3)
+    labels = rng.integers(0, 9, (40, 30)).astype(np.int32)
+    words = rng.normal(-3.0, 1.2, labels.shape).astype(np.float32)
+    found = said_of(labels, words, 10)  # label 9: no pixel
+    largest = maximum(words, labels, np.arange(9))
+    np.testing.assert_array_equal(found[:9], largest >= 0.0)
+    assert 0 < found.sum() < 9 and not found[9]
