@@ -79,6 +79,15 @@ def spread(kernel: Callable[..., object], count: int, *arguments: object, few: i
             part.result()
 
 
+def map_here(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """Return `function(item)` of all items, in their order, on the cores that this thread may use."""
+    workers = min(numba.get_num_threads(), len(items))
+    if workers <= 1:
+        return [function(item) for item in items]
+    with threads(workers) as executor:
+        return list(executor.map(function, items))
+
+
 def map_items(
     function: Callable[[Item], Result],
     items: Sequence[Item],

@@ -8,12 +8,15 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from geomocap.model.small_systems import nearest_turns
+
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     """Return the proper rotations R that maximise trace(Rᵀ M) for matrices (…, 3, 3) (Kabsch 1976, Umeyama 1991)."""
-    u, _, vt = np.linalg.svd(matrix)
-    u[..., 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[..., None]
-    return u @ vt
+    rotations = np.empty(matrix.shape)
+    given = np.ascontiguousarray(matrix, np.float64).reshape(-1, 3, 3)
+    nearest_turns(given, rotations.reshape(-1, 3, 3))
+    return rotations
 
 
 def rigid_motion(

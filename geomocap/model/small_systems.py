@@ -76,7 +76,7 @@ def solve_symmetric(N, b, x):
 def nearest_turn(M, R):
     """Proper rotation that maximises trace(Rᵀ M), into R (3, 3), by one-sided Jacobi rotations (Hestenes 1958).
 
-    For single matrices what `rotations.nearest_rotation` is for many; the identity if M has rank 0 or just 1.
+    The identity if M has rank 0 or just 1.
     """
     U, V = M.copy(), np.eye(3)
     lengths = np.empty(3)
@@ -134,3 +134,10 @@ def nearest_turn(M, R):
     for i in range(3):
         for j in range(3):
             R[i, j] = u[0, i] * v[0, j] + u[1, i] * v[1, j] + u[2, i] * v[2, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def nearest_turns(matrices, rotations):
+    """Fill in the proper rotation (N, 3, 3) nearest to each matrix (N, 3, 3)."""
+    for k in range(len(matrices)):
+        nearest_turn(matrices[k], rotations[k])

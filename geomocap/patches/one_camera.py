@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numba import njit
 from scipy.spatial import cKDTree
 
 from geomocap.patches.alignment_kernel import COHERENT
@@ -67,17 +68,34 @@ def image_precision(patches: Patches, which: np.ndarray, camera: np.ndarray, cor
     which, camera : (A,) int
     correlation : (A,) float
     """
-    template = patches.store.templates[patches.rows[which], camera, -1].astype(np.float64)
-    usable = patches.store.usable[patches.rows[which], camera][:, :, None] != 0
-    count = np.maximum(usable.sum(axis=1), 1)
-    free = np.where(usable, template - (template * usable).sum(axis=1, keepdims=True) / count[:, None], 0.0)
-    slopes = free[:, :, 1:]
-    tensor = np.swapaxes(slopes, 1, 2) @ slopes
-    weakest = np.linalg.eigvalsh(tensor)[:, 0]
-    variance = (free[:, :, 0] ** 2).sum(axis=1) / count[:, 0]
-    misfit = variance * np.maximum(1 - correlation * np.abs(correlation), 0.0)
-    residual = misfit * np.maximum(COHERENT * count[:, 0], 1.0) + _NOISE**2
-    return np.sqrt(residual / np.maximum(weakest, 1e-12))
+    result = np.empty(len(which))
+    store = patches.store
+    _image_precision(store.templates, store.usable, patches.rows[which], camera, correlation, result)
+    return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _image_precision(templates, usable, rows, camera, correlation, result):
+    for n in range(len(rows)):
+        template, has = templates[rows[n], camera[n], -1], usable[rows[n], camera[n]]
+        count, sums, products = 0, np.zeros(3), np.zeros((3, 3))
+        for m in range(len(has)):
+            if has[m]:
+                count += 1
+                for i in range(3):
+                    sums[i] += np.float64(template[m, i])
+        for i in range(3):
+            sums[i] /= max(count, 1)
+        for m in range(len(has)):
+            if has[m]:
+                for i in range(3):
+                    for j in range(i + 1):
+                        products[i, j] += (template[m, i] - sums[i]) * (template[m, j] - sums[j])
+        half, difference = 0.5 * (products[1, 1] + products[2, 2]), 0.5 * (products[1, 1] - products[2, 2])
+        weakest = half - np.sqrt(difference * difference + products[2, 1] * products[2, 1])
+        r = correlation[n]
+        misfit = products[0, 0] / max(count, 1) * max(1.0 - r * abs(r), 0.0)
+        result[n] = np.sqrt((misfit * max(COHERENT * count, 1.0) + _NOISE * _NOISE) / max(weakest, 1e-12))
 
 
 def _on_surface(

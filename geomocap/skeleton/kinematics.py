@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from scipy.spatial.transform import Rotation
 
 from geomocap.errors import GeometryError
@@ -131,10 +132,9 @@ class BodyMotion:
         fractions : (N, C) float
             They sum to one.
         """
-        result = np.zeros((len(self.rotations), len(points), 3))
-        for k in range(bodies.shape[1]):
-            moved = np.einsum("tnij,nj->tni", self.rotations[:, bodies[:, k]], points)
-            result += fractions[:, k, None] * (moved + self.translations[:, bodies[:, k]])
+        result = np.empty((len(self.rotations), len(points), 3))
+        given = (np.ascontiguousarray(a, float) for a in (self.rotations, self.translations, points, fractions))
+        _carry(*given, np.ascontiguousarray(bodies, np.int32), result)
         return result
 
 
@@ -219,3 +219,18 @@ def since(motion: BodyMotion, frame: int) -> BodyMotion:
     rotations = motion.rotations @ motion.rotations[frame].swapaxes(1, 2)
     moved = np.einsum("tbij,bj->tbi", rotations, motion.translations[frame])
     return BodyMotion(rotations, motion.translations - moved)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _carry(rotations, translations, points, fractions, bodies, result):
+    for t in range(len(rotations)):
+        for n in range(len(points)):
+            for i in range(3):
+                total = 0.0
+                for k in range(bodies.shape[1]):
+                    b = bodies[n, k]
+                    moved = translations[t, b, i]
+                    for j in range(3):
+                        moved += rotations[t, b, i, j] * points[n, j]
+                    total += fractions[n, k] * moved
+                result[t, n, i] = total

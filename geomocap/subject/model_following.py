@@ -16,6 +16,7 @@ from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.rotations import turn_angles
 from geomocap.progress import Progress, silent
+from geomocap.scheduling import map_here
 from geomocap.skeleton.articulated_adjustment import adjust
 from geomocap.skeleton.body_observations import Observations, SkinPoints
 from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, body_motion
@@ -185,7 +186,7 @@ class _Sequence:
             settings.along,
             settings.independence,
         )
-        views = [_view(*read(t), t, spacing, scales, settings.points) for t in range(frames)]
+        views = map_here(lambda t: _view(*read(t), t, spacing, scales, settings.points), range(frames))
         colored = all(v.sought.colors is not None for v in views)
         return cls(model, ModelSurface.of_model(model, settings.points, colored), views, scales, settings)
 
@@ -211,7 +212,8 @@ class _Sequence:
         motion = _fit_all(self.model, self.surface, motion, self.views, self.scales, paths, self.settings)
         bodies = body_motion(self.model.linkage, motion)
         posed = self.surface.posed(bodies)
-        distance = np.array([distance_between(p, v) for p, v in zip(posed, self.views, strict=True)])
+        pairs = list(zip(posed, self.views, strict=True))
+        distance = np.array(map_here(lambda pair: distance_between(*pair), pairs))
         progress(_STAGE, frames + 1, frames + 1)
         return FollowedSequence(bodies, distance, first)
 

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geomocap.model.surface import outward_normals
+from geomocap.scheduling import map_here
 from geomocap.skeleton.body_observations import Observations, SkinPoints
 from geomocap.skeleton.kinematics import BodyMotion
 from geomocap.subject.subject_model import SubjectModel
@@ -160,7 +161,8 @@ def match_surfaces(
     frames : sequence of FrameSurface
     scales : MatchingScales
     """
-    return Observations.of_frames([_match(a, b, scales) for a, b in zip(posed, frames, strict=True)])
+    pairs = list(zip(posed, frames, strict=True))
+    return Observations.of_frames(map_here(lambda pair: _match(*pair, scales), pairs))
 
 
 def _match(posed: OrientedPoints, frame: FrameSurface, scales: MatchingScales) -> tuple[np.ndarray, ...]:

@@ -13,7 +13,7 @@ from geomocap.model.rotations import turn_angles
 from geomocap.skeleton.adjustment_kernel import normal_equations
 from geomocap.skeleton.articulated_adjustment import JointPrior, _system, adjust
 from geomocap.skeleton.body_observations import Observations, SkinPoints
-from geomocap.skeleton.kinematics import Linkage, body_motion, joint_motion, moved_by, posed, since
+from geomocap.skeleton.kinematics import BodyMotion, Linkage, body_motion, joint_motion, moved_by, posed, since
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
 from geomocap.skeleton.motion_skeleton_settings import RefinementSettings
 from geomocap.skeleton.motion_smoothness import Smoothness, accelerations
@@ -316,3 +316,17 @@ def test_no_rounds_mean_no_change():
     bodies = find_motion_bodies(paths)
     found = find_motion_skeleton(bodies, 30.0)
     assert refine_skeleton(found, bodies, paths, RefinementSettings(rounds=0)) == (found, bodies)
+
+
+def test_points_are_carried_by_blends_of_bodies():
+    rng = np.random.default_rng(5)
+    rotations = Rotation.random(12, rng).as_matrix().reshape(4, 3, 3, 3)
+    translations, points = rng.normal(size=(4, 3, 3)), rng.normal(size=(6, 3))
+    bodies, fractions = rng.integers(0, 3, (6, 2)), rng.dirichlet([1.0, 1.0], 6)
+    expected = sum(
+        fractions[:, k, None]
+        * (np.einsum("tnij,nj->tni", rotations[:, bodies[:, k]], points) + translations[:, bodies[:, k]])
+        for k in range(2)
+    )
+    got = BodyMotion(rotations, translations).carry(points, bodies, fractions)
+    np.testing.assert_allclose(got, expected, atol=1e-12)
