@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+from numba import njit
 from scipy.ndimage import binary_fill_holes
 
 from geomocap.patches.frame_views import FrameViews
+from geomocap.scheduling import spread
 
 _STEP = 0.7  # voxels
 _GAP = 4  # steps outside; narrower gaps are between the stairs of a surface seen at a flat angle
-_CHUNK = 2000  # points at once
 
 
 def nothing_behind(view: FrameViews, points: np.ndarray) -> np.ndarray:
@@ -35,17 +35,35 @@ def nothing_behind(view: FrameViews, points: np.ndarray) -> np.ndarray:
     filled = np.zeros(surface.max(axis=0) + 2, bool)
     filled[tuple(surface.T)] = True
     filled = binary_fill_holes(filled)
-    last = np.array(filled.shape) - 1
     steps = _STEP * size * np.arange(int(np.ceil(np.linalg.norm(filled.shape) / _STEP)))
     result = np.empty((len(points), view.count), bool)
-    for low in range(0, len(points), _CHUNK):
-        some = points[low : low + _CHUNK]
-        for c, center in enumerate(view.centers):
-            direction = some - center
-            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-            at = np.floor((some[:, None] + steps[:, None] * direction[:, None] - origin) / size).astype(np.int64)
-            at = at.clip(0, last)  # the outermost voxels are empty
-            inside = filled[at[:, :, 0], at[:, :, 1], at[:, :, 2]]
-            gap = ~sliding_window_view(inside[:, :-1], _GAP, axis=1).any(axis=2)
-            result[low : low + _CHUNK, c] = ~(inside[:, _GAP:] & gap).any(axis=1)
+    places, centers = np.ascontiguousarray(points, float), np.ascontiguousarray(view.centers, float)
+    spread(_nothing_behind, len(places), places, centers, filled, origin, size, steps, result)
     return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _nothing_behind(begin, end, points, centers, filled, origin, size, steps, result):
+    direction, cell = np.empty(3), np.empty(3, np.int64)
+    for n in range(begin, end):
+        for c in range(result.shape[1]):
+            length = 0.0
+            for i in range(3):
+                direction[i] = points[n, i] - centers[c, i]
+                length += direction[i] * direction[i]
+            length = np.sqrt(length)
+            for i in range(3):
+                direction[i] /= length
+            empty = 0
+            result[n, c] = True
+            for step in steps:
+                for i in range(3):
+                    at = int(np.floor((points[n, i] + step * direction[i] - origin[i]) / size))
+                    cell[i] = min(max(at, 0), filled.shape[i] - 1)  # the outermost voxels are empty
+                if not filled[cell[0], cell[1], cell[2]]:
+                    empty += 1
+                elif empty >= _GAP:
+                    result[n, c] = False
+                    break
+                else:
+                    empty = 0
