@@ -57,8 +57,9 @@ def _with_arrays(surface: np.ndarray, points: np.ndarray, center: np.ndarray) ->
 
 def test_rays_are_walked_as_with_whole_arrays():
     rng = np.random.default_rng(2)
-    balls = [_shell(center, 0.15) for center in ((0.4, 0, 0), (-0.3, 0.1, 0), (0, -0.2, 0.4))]
-    surface, centers = np.concatenate(balls), 3.0 * rng.normal(size=(4, 3))
+    middles = np.array([[0.4, 0, 0], [-0.3, 0.1, 0], [0, -0.2, 0.4]])
+    surface = np.concatenate([_shell(middle, 0.15) for middle in middles])
+    centers = 5 * middles[[0, 0, 1, 2]] - 4 * middles[[1, 2, 2, 0]]  # each sees one ball before another
     view = replace(MovingEllipsoid(n_cameras=4).view(0), surface=surface, voxel_size=VOXEL, centers=centers)
     points = surface + rng.normal(scale=0.2 * VOXEL, size=surface.shape)
     found = nothing_behind(view, points)
