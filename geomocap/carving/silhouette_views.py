@@ -14,6 +14,7 @@ from geomocap.model.rig import Rig
 
 BORDER = 3  # a silhouette that comes as near as this to the border of the image reaches it (pixels)
 LEAST_CUT = 3  # if so many of its pixels do
+_AROUND = 16  # pixels around the subject: voxels are coloured by windows that reach a little beyond it
 SPECK = 0.01  # of the area that silhouettes have
 
 
@@ -110,8 +111,8 @@ class Undistortion:
         Width and height of the original images.
     projections : (C, 3, 4) float
         World metres to COLMAP pixels of the undistorted images.
-    sources : tuple of C (H'_c, W'_c) int64
-        Flat index of the original pixel that holds the centre of each undistorted pixel; 0 where none does.
+    sources : tuple of C (H'_c, W'_c, 2) int16
+        Column and row of the original pixel that holds the centre of each undistorted pixel; 0 where none does.
     maps : tuple of C pairs
         Fixed-point maps for interpolating `cv2.remap`.
     valid : (C, H, W) uint8
@@ -137,7 +138,7 @@ class Undistortion:
             seen = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
             if not camera.is_undistorted():
                 seen &= _unfolded(map_x, map_y, flat.cameras[c].principal_point_x, flat.cameras[c].principal_point_y)
-            sources.append(np.where(seen, y * camera.width + x, 0).astype(np.int64))
+            sources.append(np.where(seen, [x, y], 0).transpose(1, 2, 0).astype(np.int16))
             maps.append(cv2.convertMaps(map_x, map_y, cv2.CV_16SC2))
             valid.append(seen.view(np.uint8))
         return cls(rig.names, rig.sizes, flat.projections, tuple(sources), tuple(maps), pad(valid))
@@ -148,19 +149,23 @@ class Undistortion:
         C, H, W = self.valid.shape
         flat = np.zeros((C, H, W), np.uint8)
         for c, (mask, source) in enumerate(zip(masks, self.sources, strict=True)):
-            h, w = source.shape
-            flat[c, :h, :w] = (mask != 0).view(np.uint8).ravel()[source]
+            h, w = source.shape[:2]
+            flat[c, :h, :w] = cv2.remap((mask != 0).view(np.uint8), source, None, cv2.INTER_NEAREST)
         flat &= self.valid
         return PinholeViews(self.names, self.projections, flat, self.valid)
 
-    def images(self, images: Sequence[np.ndarray]) -> np.ndarray:
-        """Undistort the images (H_c, W_c, 3) of one frame, bilinear: (C, H, W, 3) uint8."""
+    def images(self, images: Sequence[np.ndarray], around: PinholeViews | None = None) -> np.ndarray:
+        """Undistort the images (H_c, W_c, 3) of one frame, bilinear: (C, H, W, 3) uint8.
+
+        `around` asks for the subject and what is near it only; elsewhere the result is black.
+        """
         self._check(images)
         C, H, W = self.valid.shape
         flat = np.zeros((C, H, W, 3), np.uint8)
         for c, (image, (whole, part)) in enumerate(zip(images, self.maps, strict=True)):
             h, w = whole.shape[:2]
-            flat[c, :h, :w] = cv2.remap(image, whole, part, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            box = (slice(0, h), slice(0, w)) if around is None else _around(around.masks[c, :h, :w])
+            flat[(c, *box)] = cv2.remap(image, whole[box], part[box], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return flat
 
     def _check(self, images: Sequence[np.ndarray]) -> None:
@@ -171,6 +176,12 @@ class Undistortion:
                 raise CalibrationError(
                     f"camera {name}: image of {image.shape[1]}×{image.shape[0]}, but calibrated for {w}×{h}"
                 )
+
+
+def _around(mask: np.ndarray) -> tuple[slice, slice]:
+    """Rows and columns of what is not 0 in a mask, and a little more."""
+    x, y, w, h = cv2.boundingRect(np.ascontiguousarray(mask))
+    return slice(max(y - _AROUND, 0), y + h + _AROUND), slice(max(x - _AROUND, 0), x + w + _AROUND)
 
 
 def undistort_masks(rig: Rig, masks: Sequence[np.ndarray]) -> PinholeViews:

@@ -99,7 +99,8 @@ def track(
     undistortion = Undistortion.of(rig)
 
     def read(frame: int, reduction: int) -> FrameViews:
-        straight, views = undistortion.images(images[frame]), undistortion.views(masks[frame])
+        views = undistortion.views(masks[frame])
+        straight = undistortion.images(images[frame], views)
         return FrameViews.of(views, straight, volumes[frame], settings.blurs_px, reduction)
 
     reduction = settings.reduction or image_reduction(read(0, 1), settings)

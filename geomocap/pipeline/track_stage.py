@@ -130,10 +130,10 @@ class ReadFrame:
     def __call__(self, frame: int) -> FrameViews:
         """Read one frame."""
         cameras = self.capture.cameras
-        images = self.undistortion.images([self.capture.frame(c, frame) for c in cameras])
-        masks = [read_silhouette(self.run, c, frame) for c in cameras]
+        views = self.undistortion.views([read_silhouette(self.run, c, frame) for c in cameras])
+        images = self.undistortion.images([self.capture.frame(c, frame) for c in cameras], views)
         if self.cloud_spacing is None:
             surface = read_voxels(self.run.frame_file("voxels", frame))
         else:
             surface = surface_voxels(read_points(self.run.frame_file("cloud", frame)).positions, self.cloud_spacing)
-        return FrameViews.of(self.undistortion.views(masks), images, surface, self.settings.blurs_px, self.reduction)
+        return FrameViews.of(views, images, surface, self.settings.blurs_px, self.reduction)
