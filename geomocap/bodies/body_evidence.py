@@ -125,10 +125,11 @@ def judge(
 def _judge(
     body: int, model: BodyModel, evidence: Evidence, criterion: Criterion, contacts: np.ndarray, known: Turns
 ) -> Candidate:
-    neighbours = np.flatnonzero(contacts[body] >= _LEAST_CONTACTS)
-    members = np.flatnonzero(model.label == body)
-    if not len(neighbours) or not len(members):
+    members, touching = np.flatnonzero(model.label == body), contacts[body]
+    if not len(members) or not touching.any():
         return Candidate(body, np.inf, -1, np.inf, np.inf)
+    # few samples may touch others in fewer places
+    neighbours = np.flatnonzero(touching >= min(_LEAST_CONTACTS, touching.max()))
     some = members
     if len(members) > _MOST_SAMPLES:
         some = members[np.linspace(0, len(members) - 1, _MOST_SAMPLES).astype(int)]

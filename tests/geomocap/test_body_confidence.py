@@ -1,11 +1,17 @@
 """When a body is one: its confidence, and its size."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from geomocap.bodies.body_evidence import Criterion, judge
+from geomocap.bodies.body_model import model_of_labels
 from geomocap.bodies.body_settings import MotionBodiesSettings
+from geomocap.bodies.first_bodies import first_bodies
 from geomocap.bodies.motion_bodies import find_motion_bodies
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.trajectories.completion import complete_tracks
 from tests.geomocap.moving_chains import chain, seen_by_single_cameras
 
 
@@ -53,3 +59,19 @@ def test_a_small_body_that_single_cameras_see_goes(three):
     assert find_motion_bodies(MotionPaths(positions), small).body_count == 3
     assert find_motion_bodies(MotionPaths(positions, ray=ray), small).body_count == 2  # each counts two thirds
     assert find_motion_bodies(MotionPaths(positions, ray=ray), MotionBodiesSettings()).body_count == 3
+
+
+def test_few_samples_that_hardly_touch_others_are_no_body(three):
+    paths, settings = MotionPaths(three.positions), MotionBodiesSettings()
+    first = first_bodies(*complete_tracks(paths), paths, settings)
+    label = three.body.copy()
+    label[7] = 3
+    linked = first.evidence.adjacency.tolil()
+    only = linked[7].nonzero()[1][0]
+    linked[7], linked[:, 7] = 0, 0
+    linked[7, only] = linked[only, 7] = 1
+    evidence = replace(first.evidence, adjacency=linked.tocsr())
+    model = model_of_labels(label, evidence)
+    criterion = Criterion(settings.least_turn(rigid=False), first.noise, settings.min_fraction, settings.soft_fraction)
+    (candidate,) = judge([3], model, evidence.with_places_open(), criterion).values()
+    assert candidate.strength < 0.5
