@@ -181,7 +181,9 @@ class Undistortion:
 def _around(mask: np.ndarray) -> tuple[slice, slice]:
     """Rows and columns of what is not 0 in a mask, and a little more."""
     x, y, w, h = cv2.boundingRect(np.ascontiguousarray(mask))
-    return slice(max(y - _AROUND, 0), y + h + _AROUND), slice(max(x - _AROUND, 0), x + w + _AROUND)
+    height, width = mask.shape
+    rows = slice(max(y - _AROUND, 0), min(y + h + _AROUND, height))
+    return rows, slice(max(x - _AROUND, 0), min(x + w + _AROUND, width))
 
 
 def undistort_masks(rig: Rig, masks: Sequence[np.ndarray]) -> PinholeViews:
