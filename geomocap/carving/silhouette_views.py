@@ -15,6 +15,7 @@ from geomocap.model.rig import Rig
 BORDER = 3  # a silhouette that comes as near as this to the border of the image reaches it (pixels)
 LEAST_CUT = 3  # if so many of its pixels do
 _AROUND = 16  # pixels around the subject: voxels are coloured by windows that reach a little beyond it
+_WHOLE = np.empty((0, 0), np.uint16)  # parts of a pixel, as `cv2.remap` wants them: none
 SPECK = 0.01  # of the area that silhouettes have
 
 
@@ -150,7 +151,7 @@ class Undistortion:
         flat = np.zeros((C, H, W), np.uint8)
         for c, (mask, source) in enumerate(zip(masks, self.sources, strict=True)):
             h, w = source.shape[:2]
-            flat[c, :h, :w] = cv2.remap((mask != 0).view(np.uint8), source, None, cv2.INTER_NEAREST)
+            flat[c, :h, :w] = cv2.remap((mask != 0).view(np.uint8), source, _WHOLE, cv2.INTER_NEAREST)
         flat &= self.valid
         return PinholeViews(self.names, self.projections, flat, self.valid)
 

@@ -133,8 +133,9 @@ class BodyMotion:
             They sum to one.
         """
         result = np.empty((len(self.rotations), len(points), 3))
-        given = (np.ascontiguousarray(a, float) for a in (self.rotations, self.translations, points, fractions))
-        _carry(*given, np.ascontiguousarray(bodies, np.int32), result)
+        rotations, translations = (np.ascontiguousarray(a, float) for a in (self.rotations, self.translations))
+        rest, shares = (np.ascontiguousarray(a, float) for a in (points, fractions))
+        _carry(rotations, translations, rest, shares, np.ascontiguousarray(bodies, np.int32), result)
         return result
 
 
