@@ -15,6 +15,7 @@ blend of them: a fixed fraction of how far they carry it apart, but no more than
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -136,7 +137,7 @@ def _judge(
     samples = criterion.noise.independent(evidence.rest[some], len(members)) * _coverage(evidence.seen[members])
     observations = _directions(members, evidence) * samples
     nats, own = _explained(body, neighbours, some, observations, model, evidence, criterion)
-    by_evidence = nats / (0.5 * _FREEDOMS * np.log(max(observations, np.e)))
+    by_evidence = nats / (0.5 * _FREEDOMS * np.log(max(observations, math.e)))
     # what noise feigns is no turn
     inertia = max(samples, 1.0) * _square_radius(evidence.rest[members])
     feigned = _FEIGNED * max(criterion.noise.variance, own) / max(inertia, 1e-12)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -68,7 +69,7 @@ def find_hinges(linkage: Linkage, motion: JointMotion, information: np.ndarray, 
     for j, child in enumerate(linkage.hierarchy.joint_bodies[:, 1]):
         axis, off = hinge_axis(motion.local[:, child], information[:, j])
         chi2 = float(np.einsum("ti,tij,tj->", off, information[:, j], off))
-        hinge[j] = chi2 <= (2 * motion.frames - 2) * np.log(max(float(observations[j]), np.e))
+        hinge[j] = chi2 <= (2 * motion.frames - 2) * np.log(max(float(observations[j]), math.e))
         axes[j] = axis
     return replace(linkage, axes=axes, hinge=hinge)
 
