@@ -14,7 +14,6 @@ from geomocap.model.rig import Rig
 
 BORDER = 3  # a silhouette that comes as near as this to the border of the image reaches it (pixels)
 LEAST_CUT = 3  # if so many of its pixels do
-_AROUND = 16  # pixels around the subject: voxels are coloured by windows that reach a little beyond it
 _WHOLE = np.empty((0, 0), np.uint16)  # parts of a pixel, as `cv2.remap` wants them: none
 SPECK = 0.01  # of the area that silhouettes have
 
@@ -155,18 +154,22 @@ class Undistortion:
         flat &= self.valid
         return PinholeViews(self.names, self.projections, flat, self.valid)
 
-    def images(self, images: Sequence[np.ndarray], around: PinholeViews | None = None) -> np.ndarray:
+    def images(self, images: Sequence[np.ndarray], of_subject: PinholeViews | None = None) -> np.ndarray:
         """Undistort the images (H_c, W_c, 3) of one frame, bilinear: (C, H, W, 3) uint8.
 
-        `around` asks for the subject and what is near it only; elsewhere the result is black.
+        With silhouettes, `of_subject`, only the boxes around them are wanted; the rest stays black.
         """
         self._check(images)
         C, H, W = self.valid.shape
         flat = np.zeros((C, H, W, 3), np.uint8)
         for c, (image, (whole, part)) in enumerate(zip(images, self.maps, strict=True)):
             h, w = whole.shape[:2]
-            box = (slice(0, h), slice(0, w)) if around is None else _around(around.masks[c, :h, :w])
-            flat[(c, *box)] = cv2.remap(image, whole[box], part[box], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            x, y, wide, high = (0, 0, w, h) if of_subject is None else cv2.boundingRect(of_subject.masks[c])
+            box = slice(y, y + high), slice(x, x + wide)
+            if wide * high > 0:
+                flat[(c, *box)] = cv2.remap(
+                    image, whole[box], part[box], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+                )
         return flat
 
     def _check(self, images: Sequence[np.ndarray]) -> None:
@@ -177,14 +180,6 @@ class Undistortion:
                 raise CalibrationError(
                     f"camera {name}: image of {image.shape[1]}×{image.shape[0]}, but calibrated for {w}×{h}"
                 )
-
-
-def _around(mask: np.ndarray) -> tuple[slice, slice]:
-    """Rows and columns of what is not 0 in a mask, and a little more."""
-    x, y, w, h = cv2.boundingRect(np.ascontiguousarray(mask))
-    height, width = mask.shape
-    rows = slice(max(y - _AROUND, 0), min(y + h + _AROUND, height))
-    return rows, slice(max(x - _AROUND, 0), min(x + w + _AROUND, width))
 
 
 def undistort_masks(rig: Rig, masks: Sequence[np.ndarray]) -> PinholeViews:

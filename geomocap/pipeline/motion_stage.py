@@ -12,15 +12,12 @@ from geomocap.files.run import Run
 from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.ellipsoids import Ellipsoids, fit_ellipsoids
 from geomocap.model.frame_geometry import BodyPoints, Geometry
-from geomocap.model.motion_paths import MotionPaths
-from geomocap.model.outlines import Outlines
 from geomocap.motion import Motion, MotionSettings, find_motion
 from geomocap.pipeline.following_stage import write_followed
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.motion_models import fitted_to_surfaces, make_model, misfit, silhouette_overlap
 from geomocap.pipeline.outline_reading import outlines_of
 from geomocap.pipeline.path_choice import motion_paths
-from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items
 from geomocap.skeleton.kinematics import posed
 from geomocap.subject.subject_model import MODEL_FILE, SubjectModel, write_model
@@ -62,12 +59,10 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     )
     with job.run.timed("motion") as count:
         outlines = outlines_of(job) if any(paths.ray is not None for paths in choice.values()) else None
-        find = _Find(job.fps, settings, outlines)
-        if len(choice) == 1:
-            motions = [find(paths, job.progress) for paths in choice.values()]
-        else:
-            motions = list(map_items(find, list(choice.values()), job.executor, "bodies", job.progress))
-        found_from = dict(zip(choice, motions, strict=True))
+        found_from = {
+            source: find_motion(paths, fps=job.fps, settings=settings, progress=job.progress, outlines=outlines)
+            for source, paths in choice.items()
+        }
         count["items"] = frames
     candidates = {source: _candidate(job, geometry, motion, len(choice) > 1) for source, motion in found_from.items()}
     source = min(candidates, key=lambda which: candidates[which].misfit)
@@ -120,18 +115,6 @@ def _candidate(job: Job, geometry: Geometry, motion: Motion, several: bool) -> _
     if job.capture is None or isinstance(model, str) or not several:
         return _Candidate(motion, model, None)
     return _Candidate(motion, model, silhouette_overlap(job, model, motion))
-
-
-@dataclass(frozen=True)
-class _Find:
-    """Bodies and skeleton from one kind of motion paths."""
-
-    fps: float
-    settings: MotionSettings
-    outlines: Outlines | None
-
-    def __call__(self, paths: MotionPaths, progress: Progress = silent) -> Motion:
-        return find_motion(paths, fps=self.fps, settings=self.settings, progress=progress, outlines=self.outlines)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from geomocap.evaluation.camera_check import BACKGROUND_FRAMES
 from geomocap.files.capture import Capture
 from geomocap.files.images import write_mask
 from geomocap.files.run import Run, stage_key
-from geomocap.model.rig import Rig
+from geomocap.model.rig import Rig, reduction
 from geomocap.pipeline.correction_stage import LearnBackground, reduced, with_cameras
 from geomocap.pipeline.job import Job
 from geomocap.scheduling import map_items
@@ -22,8 +22,11 @@ from geomocap.silhouettes.region import region_of_points
 from geomocap.silhouettes.silhouette_scene import SilhouetteScene, learning_frames
 
 LONGEST = 960
-"""Longer side of the images that are decided on, pixels, about: larger ones are reduced by a whole factor. A voxel of
-the default grid is some 3 pixels of these where the subject fills the image."""
+"""Longer side of the images that are decided on, pixels, about: larger ones are reduced by a whole factor.
+
+A voxel of the default grid is nearly 4 pixels of these where the subject fills the image. Of a real person in
+1080 × 1920 pixels outlines had fewer spurs than at full size, in two fifths of the time; no other value was tried.
+"""
 
 
 def silhouettes(job: Job) -> str:
@@ -124,7 +127,7 @@ class _Copy:
 
 def _shrink(capture: Capture) -> int:
     """Factor by which all images are reduced."""
-    return max(1, round(max(max(capture.sources[c].size) for c in capture.cameras) / LONGEST))
+    return max(reduction(*capture.sources[c].size, LONGEST) for c in capture.cameras)
 
 
 def _read(capture: Capture, frame: int, shrink: int) -> list[np.ndarray]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -91,7 +90,7 @@ def test_images_land_where_masks_do():
     assert ((images[..., 0] > 100) != (views.masks != 0)).mean() < 0.004  # interpolated edges apart
 
 
-def test_images_are_undistorted_around_the_subject_only_where_that_is_asked():
+def test_images_are_undistorted_where_the_subject_is_if_that_is_enough():
     r = rig((160, 120, [140, 140, 80, 60, -0.2, 0.05, 0, 0]), (100, 90, [120, 120, 50, 45, 0, 0, 0, 0]))
     masks = [np.zeros((120, 160), np.uint8), np.zeros((90, 100), np.uint8)]
     masks[0][40:50, 60:90] = 1
@@ -101,11 +100,10 @@ def test_images_are_undistorted_around_the_subject_only_where_that_is_asked():
     views = undistortion.views(masks)
     whole, part = undistortion.images(images), undistortion.images(images, views)
     for c, mask in enumerate(views.masks):
-        near = cv2.dilate(mask, np.ones((21, 21), np.uint8)) != 0
-        np.testing.assert_array_equal(part[c][near], whole[c][near])
-        assert 0.02 < (part[c] != 0).mean() < 0.3
+        np.testing.assert_array_equal(part[c][mask != 0], whole[c][mask != 0])
+        assert 0 < (part[c] != 0).mean() < 0.2
     empty = undistortion.views([np.zeros_like(m) for m in masks])
-    assert (undistortion.images(images, empty) != 0).mean() < 0.05
+    assert not undistortion.images(images, empty).any()
 
 
 def test_a_polynomial_that_folds_back_shows_nothing_twice():
