@@ -196,12 +196,18 @@ def _explain_one(
             if not allowed[i, b] or not adjacent[a, b]:
                 continue
             # observed = w carried_a + (1 - w) carried_b: linear in w
-            above, below = 0.0, 1e-18
+            # three sums each, of which none waits for another
+            x0, x1, x2, y0, y1, y2 = 0.0, 0.0, 0.0, 1e-18, 0.0, 0.0
             for t in range(frames):
-                for c in range(3):
-                    difference = miss[b, t, c] - miss[a, t, c]
-                    above += weights[i, t] * miss[b, t, c] * difference
-                    below += weights[i, t] * difference * difference
+                w = weights[i, t]
+                d0, d1, d2 = miss[b, t, 0] - miss[a, t, 0], miss[b, t, 1] - miss[a, t, 1], miss[b, t, 2] - miss[a, t, 2]
+                x0 += w * miss[b, t, 0] * d0
+                x1 += w * miss[b, t, 1] * d1
+                x2 += w * miss[b, t, 2] * d2
+                y0 += w * d0 * d0
+                y1 += w * d1 * d1
+                y2 += w * d2 * d2
+            above, below = x0 + x1 + x2, y0 + y1 + y2
             # of w² below - 2 w above + constant + 4 w (1 - w) penalty: the least in [0, 1]
             curve = below / total - 4.0 * penalty
             if curve <= 1e-18:

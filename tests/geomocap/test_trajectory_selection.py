@@ -1,0 +1,46 @@
+"""Choosing trajectories: evenly over the surface, long ones first, and short ones where there are no others."""
+
+import numpy as np
+
+from geomocap.trajectories.selection import spread_out
+
+FRAMES = 60
+
+
+def trajectories(places: np.ndarray, lengths: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Points (N, 3) that stay, each seen for so many frames in a row: (N, T, 3), NaN elsewhere."""
+    seen = np.full((len(places), FRAMES, 3), np.nan)
+    for row, length in enumerate(lengths):
+        begin = rng.integers(FRAMES - length + 1)
+        seen[row, begin : begin + length] = places[row]
+    return seen
+
+
+def test_a_part_that_is_seen_for_short_times_only_is_chosen_too() -> None:
+    rng = np.random.default_rng(0)
+    trunk, limb = rng.uniform(0, 1, (1500, 3)), rng.uniform(2, 2.3, (200, 3))
+    lengths = np.concatenate([rng.integers(30, 60, 1500), rng.integers(6, 10, 200)])
+    chosen = spread_out(trajectories(np.concatenate([trunk, limb]), lengths, rng), 400)
+    assert np.count_nonzero(chosen >= 1500) > 10
+
+
+def test_what_is_hardly_ever_seen_is_left_out() -> None:
+    rng = np.random.default_rng(0)
+    lengths = np.where(np.arange(300) % 2 == 0, 5, 30)
+    chosen = spread_out(trajectories(rng.uniform(0, 1, (300, 3)), lengths, rng), 1000)
+    np.testing.assert_array_equal(chosen, np.arange(1, 300, 2))
+
+
+def test_of_neighbours_the_longest_is_chosen_and_the_number_is_kept() -> None:
+    rng = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(*3 * [np.arange(5.0)]), axis=-1).reshape(-1, 3)
+    places = np.concatenate([grid, grid + 0.01])
+    lengths = np.repeat([20, 59], len(grid))
+    chosen = spread_out(trajectories(places, lengths, rng), len(grid))
+    np.testing.assert_array_equal(chosen, np.arange(len(grid), 2 * len(grid)))
+
+
+def test_few_are_all_taken() -> None:
+    rng = np.random.default_rng(0)
+    chosen = spread_out(trajectories(rng.uniform(0, 1, (50, 3)), np.full(50, 40), rng), 100)
+    np.testing.assert_array_equal(chosen, np.arange(50))
