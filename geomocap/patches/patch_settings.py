@@ -51,10 +51,11 @@ class TrackingSettings(Settings):
         "updated",
         description="Template: the first view of a camera, a new one where it fits badly, or the last frame's",
     )
-    # Patches on limbs of a galloping stag last for 5 to 9 frames (median). With 3 instead of 10 twice as many follow the
-    # limbs: `spread_out` has what that is worth. Tracking takes 1.6 to 2 times as long.
-    seed_every: int = Field(
-        3, ge=1, description="Frames between two looks for surface without patches; the last frame is looked at too"
+    seed_every: int | None = Field(
+        None,
+        ge=1,
+        description="Frames between two looks for surface without patches, the last frame is looked at too; "
+        "3 if not given, 10 where single cameras follow the surface",
     )
     seed_correlation: float = Field(0.85, gt=0, lt=1, description="Least correlation between cameras for a new patch")
     search_front: float = Field(

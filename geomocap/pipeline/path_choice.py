@@ -31,6 +31,7 @@ ALONE_FRACTION = (
 # and 1 was measured: half is where nodes would say more of the surface than patches do.
 LARGEST_BULK = 0.5
 ANCHORS = 2000  # trajectories that keep nodes from sliding
+ANCHOR_FRACTION = 0.1  # those are measured in this fraction of the frames at least
 
 
 def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, MotionPaths]:
@@ -148,5 +149,5 @@ def _joined(patches: MotionPaths, nodes: MotionPaths, rest: np.ndarray) -> Motio
 
 def _anchors(tracked: Trajectories) -> MotionPaths | None:
     """Trajectories that nodes are held by; None: there are none."""
-    chosen = spread_out(tracked.positions, ANCHORS)
+    chosen = spread_out(tracked.positions, ANCHORS, ANCHOR_FRACTION)
     return _paths_of(tracked, chosen) if len(chosen) else None

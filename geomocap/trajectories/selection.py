@@ -6,23 +6,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 
-def spread_out(positions: np.ndarray, count: int, least_fraction: float = 0.1) -> np.ndarray:
+def spread_out(positions: np.ndarray, count: int, least_fraction: float = 0.25) -> np.ndarray:
     """Choose about `count` long trajectories, evenly over the surface.
 
     Trajectories are taken in the order of their length; each one taken bars those that are nearer to it than a distance
     found by bisection. Nearness is judged in the middle of the taken one's life, among those measured there.
-
-    Short ones count as well: limbs that move fast have no others. Bodies of two subjects of 60 frames, mean of four
-    choices of nine tenths of the trajectories, with `seed_every` as it was and is, and the least fraction likewise:
-
-        ======  ========  ==============================  ==============================
-        seeds   fraction  galloping stag (15 bodies)      walking horse (14 bodies)
-        ======  ========  ==============================  ==============================
-        10      0.25      10.5; recall 0.27, rot. 14.7°   13.2; recall 0.62, rot. 7.0°
-        10      0.1       12.2; recall 0.50, rot. 11.8°   13.0; recall 0.63, rot. 7.7°
-        3       0.25      11.0; recall 0.46, rot. 12.0°   13.2; recall 0.67, rot. 6.7°
-        3       0.1       12.8; recall 0.64, rot. 10.0°   13.5; recall 0.77, rot. 6.5°
-        ======  ========  ==============================  ==============================
 
     Parameters
     ----------
