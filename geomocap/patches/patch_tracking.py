@@ -27,10 +27,10 @@ from geomocap.scheduling import map_items, threads
 from geomocap.trajectories.joining import join_broken
 from geomocap.trajectories.neighbour_precision import clear_unsure, with_observed_precision
 
-# Frames between two looks for surface without patches. On limbs of a galloping stag they last for 5 to 9 frames (median).
+# Frames between two looks for surface without patches. Limbs of a galloping stag keep them for 5 to 9 frames (median).
 # Bodies from tracks with 10 and with 3, means of three or four choices of nine tenths of them: joints within 5 % of the
 # height 0.27 and 0.46 (stag), 0.62 and 0.67 (walking horse), 0.87 and 0.93 (a distant man); rotations 14.7° and 12.0°,
-# 7.0° and 6.7°, 3.8° and 3.5°. Of a bird's joints fewer were some: 0.64 and 0.25. Tracking takes 1.6 to 2 times as long.
+# 7.0° and 6.7°, 3.8° and 3.5°. Of a bird's joints fewer were some: 0.64 and 0.25. Tracking takes up to twice as long.
 _LOOK = 3
 # Where single cameras follow the surface: a man before four had 0.93 of his joints with 10, 0.87 with 3.
 _LOOK_ALONE = 10

@@ -35,6 +35,11 @@ def test_the_surface_is_covered_where_two_cameras_see_too_little(views, tracks):
     assert len(track_surface(lambda k: views[k], 2, never)) < 15
 
 
+def test_they_are_placed_more_seldom(views):
+    settings = SETTINGS.model_copy(update={"seed_every": None, "backward": False})
+    assert set(np.unique(track_surface(lambda k: views[k], FRAMES, settings).placed)) <= {0, FRAMES - 1}
+
+
 def test_they_follow_the_surface_and_state_how_well(tracks):
     start = tracks.start
     error = []

@@ -331,3 +331,11 @@ def test_variances_are_the_diagonal_of_the_inverse():
     variances = np.empty(6)
     inverse_diagonal(np.linalg.cholesky(normal), variances)
     assert_allclose(variances, np.diag(np.linalg.inv(normal)), rtol=1e-12)
+
+
+def test_bare_surface_is_looked_for_in_every_third_frame(views):
+    settings = SETTINGS.model_copy(update={"seed_every": None, "backward": False})
+    blind = views[0].surface.mean(axis=0)[0] > views[0].surface[:, 0]
+    half = replace(views[0], surface=views[0].surface[blind])  # the rest shows later
+    tracks = track_surface([half, *views[1:]].__getitem__, 6, settings)
+    assert set(np.unique(tracks.placed)) == {0, 3, 5}
