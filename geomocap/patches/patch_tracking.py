@@ -30,9 +30,10 @@ from geomocap.trajectories.neighbour_precision import clear_unsure, with_observe
 # Frames between two looks for surface without patches. Limbs of a galloping stag keep them for 5 to 9 frames (median).
 # Bodies from tracks with 10 and with 3, means of three or four choices of nine tenths of them: joints within 5 % of the
 # height 0.27 and 0.46 (stag), 0.62 and 0.67 (walking horse), 0.87 and 0.93 (a distant man); rotations 14.7° and 12.0°,
-# 7.0° and 6.7°, 3.8° and 3.5°. Of a bird's joints fewer were some: 0.64 and 0.25. Tracking takes up to twice as long.
+# 7.0° and 6.7°, 3.8° and 3.5°. Of a bird's joints fewer were some: 0.64 and 0.25. Tracking takes twice as long.
 _LOOK = 3
-# Where single cameras follow the surface: a man before four had 0.93 of his joints with 10, 0.87 with 3.
+# Where single cameras follow the surface nothing was won: a man before four had 0.93 of his joints with 10, 0.87 with 3
+# (one run each).
 _LOOK_ALONE = 10
 _SMOOTH = 0.7  # fraction of the newest motion in the velocity
 _DOUBLE = 0.5  # of the spacing: patches nearer than that follow the same surface
