@@ -105,12 +105,9 @@ def match_groups(rig: Rig, settings: GroupSettings | None = None, box: Box | Non
     """
     settings = settings or GroupSettings()
     pinhole = rig.undistorted()
-    center, meet = scene_center(rig) if box is None else (np.mean(box, axis=0), True)
+    center, meet = _middle(rig, box)
     near, far = (settings.near, settings.far) if meet else _ANYWHERE
-    rays = center - rig.centers
-    distance = np.linalg.norm(rays, axis=1)
-    rays /= distance[:, None]
-    angles = np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)))
+    angles = _angles(rig, center)
     groups = []
     templates, spare = _templates(rig, angles, settings)
     for t in templates + spare:
@@ -129,6 +126,24 @@ def match_groups(rig: Rig, settings: GroupSettings | None = None, box: Box | Non
     maps = tuple(None if c.is_undistorted() else rig.undistortion_map(i) for i, c in enumerate(rig.cameras))
     count = max(sum(g.template in templates for g in groups), 1)
     return MatchGroups(pinhole, maps, tuple(groups[:count]), tuple(groups[count:]))
+
+
+def can_be_matched(rig: Rig, settings: GroupSettings, box: Box | None = None) -> bool:
+    """Whether the directions of any two cameras to the middle of the scene are alike enough, and differ enough."""
+    angles = _angles(rig, _middle(rig, box)[0])[np.triu_indices(len(rig), 1)]
+    return bool(((settings.least_angle <= angles) & (angles <= settings.greatest_angle)).any())
+
+
+def _middle(rig: Rig, box: Box | None) -> tuple[np.ndarray, bool]:
+    """Middle of the scene, and whether it is known, see `scene_center`."""
+    return scene_center(rig) if box is None else (np.mean(box, axis=0), True)
+
+
+def _angles(rig: Rig, center: np.ndarray) -> np.ndarray:
+    """Angles between the cameras' directions to a point, (C, C) float, degrees."""
+    rays = center - rig.centers
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    return np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)))
 
 
 def _templates(rig: Rig, angles: np.ndarray, settings: GroupSettings) -> tuple[list[int], list[int]]:

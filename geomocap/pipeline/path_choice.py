@@ -98,7 +98,7 @@ def _follow_nodes(job: Job, geometry: Geometry, anchors: MotionPaths | None) -> 
         following = following.model_copy(update={"part_rounds": 0})
     images = None
     if job.capture is not None and anchors is not None:
-        images = frame_reader(as_seen(job.run, job.capture), job.run, job.config.tracking)
+        images = frame_reader(as_seen(job.run, job.capture), job.run, job.config.tracking, job.config.cloud)
     nodes = track_nodes(
         geometry.points, len(geometry), following, features, job.progress, job.executor, anchors, images
     )

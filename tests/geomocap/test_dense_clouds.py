@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from geomocap.dense.dense_frame import CloudFrame, cloud_of_frame
 from geomocap.dense.dense_settings import CloudSettings, GroupSettings, TrustSettings
 from geomocap.dense.match_evidence import MatchEvidence
-from geomocap.dense.match_groups import match_groups, scene_center
+from geomocap.dense.match_groups import can_be_matched, match_groups, scene_center
 from geomocap.dense.search_bounds import box_depth, hull_depth, inside_silhouettes
 from geomocap.errors import CalibrationError, GeometryError
 from geomocap.model.frame_geometry import Voxels
@@ -225,8 +225,19 @@ def test_groups_take_neighbours_on_both_sides() -> None:
 def test_groups_that_can_t_be() -> None:
     with pytest.raises(CalibrationError, match="no two cameras"):
         match_groups(ring(2, 180))
+    with pytest.raises(CalibrationError, match="no two cameras"):
+        match_groups(ring(3, 360))
     with pytest.raises(CalibrationError, match="camX"):
         match_groups(TRIPLET, GroupSettings(template_camera="camX"))
+
+
+def test_cameras_that_can_be_matched() -> None:
+    settings = GroupSettings()
+    assert can_be_matched(TRIPLET, settings)
+    assert can_be_matched(ring(8, 360), settings)
+    assert not can_be_matched(ring(3, 360), settings)
+    assert not can_be_matched(TRIPLET, GroupSettings(greatest_angle=15.0, best_angle=10.0))
+    assert not can_be_matched(ring(2, 180), settings)
 
 
 def turned(rig: Rig, camera: int, degrees: float) -> Rig:

@@ -26,8 +26,8 @@ BOX = ((-0.6, -0.6, -0.6), (0.6, 0.6, 0.6))
 COARSE = {"cloud": {"growing": {"step": 4.0, "radius": 4}}}
 
 
-def make_capture(path: Path, frames: int = 1, masks: bool = False, cameras: int = 3) -> Capture:
-    rig = ring(cameras, 40)
+def make_capture(path: Path, frames: int = 1, masks: bool = False, cameras: int = 3, arc_deg: float = 40.0) -> Capture:
+    rig = ring(cameras, arc_deg)
     write_capture_info(path, CaptureInfo(name="ball", fps=10.0, region_of_interest=BOX))
     write_rig(path / "sparse", rig)
     for k in range(frames):

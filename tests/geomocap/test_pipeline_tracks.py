@@ -3,6 +3,7 @@
 import importlib
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose
 
 from geomocap.config import load_config
@@ -24,6 +25,21 @@ def test_a_cloud_becomes_the_voxels_that_hold_its_points():
     assert len(np.unique(voxels.indices, axis=0)) == len(voxels.indices)
     assert_allclose(voxels.voxel_size, 0.1)
     assert len(stage.surface_voxels(np.zeros((0, 3)), 0.1).indices) == 0
+
+
+@pytest.mark.parametrize(
+    ("cameras", "arc_deg", "surface"),
+    [(4, 360.0, "voxels"), (3, 40.0, "clouds"), (3, 360.0, "voxels"), (2, 40.0, "clouds"), (2, 180.0, "clouds")],
+)
+def test_tracks_lie_on_the_hull_where_it_is_all_there_can_be(tmp_path, monkeypatch, cameras, arc_deg, surface):
+    asked = []
+    for name in ("voxels", "clouds"):
+        monkeypatch.setattr(stage, name, lambda job, name=name: asked.append(name) or name)
+    monkeypatch.setattr(stage, "_track", lambda job, capture: job.run.write_npz("tracks.npz") or 1)
+    capture = make_capture(tmp_path / "capture", cameras=cameras, arc_deg=arc_deg)
+    with threads(1) as executor:
+        stage.tracks(Job(Run(tmp_path / "run"), load_config(), executor, capture=capture, fps=capture.fps))
+    assert asked == [surface]
 
 
 def test_key_points_go_with_the_tracks_they_were_followed_in(tmp_path, monkeypatch):
