@@ -14,6 +14,7 @@ from geomocap.files.scans import Scans
 from geomocap.model.frame_geometry import Geometry
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.trajectories import Trajectories
+from geomocap.motion import SAMPLES
 from geomocap.nodes.node_tracking import track_nodes
 from geomocap.nodes.node_uncertainty import carried_sigma
 from geomocap.nodes.surface_coverage import SMALLEST_PIECE, left_over, piece_reach, uncovered_fraction
@@ -22,7 +23,6 @@ from geomocap.pipeline.track_stage import frame_reader
 from geomocap.segmentation.m3 import ellipsoid_paths
 from geomocap.trajectories.selection import spread_out
 
-SAMPLES = 2000  # motion paths that bodies are found from
 ALONE_FRACTION = (
     0.5  # of the standard deviation of what a single camera sees, as most of that is depth and hardly counts
 )

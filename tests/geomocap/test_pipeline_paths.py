@@ -12,9 +12,10 @@ from geomocap.config import Config
 from geomocap.errors import GeometryError
 from geomocap.files.run import Run
 from geomocap.model.trajectories import Trajectories
+from geomocap.motion import SAMPLES
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.path_choice import ALONE_FRACTION, SAMPLES, motion_paths, patch_paths
+from geomocap.pipeline.path_choice import ALONE_FRACTION, motion_paths, patch_paths
 from geomocap.segmentation.m3_settings import SegmentationSettings
 
 FRAMES = 3
