@@ -128,10 +128,10 @@ def match_groups(rig: Rig, settings: GroupSettings | None = None, box: Box | Non
     return MatchGroups(pinhole, maps, tuple(groups[:count]), tuple(groups[count:]))
 
 
-def can_be_matched(rig: Rig, settings: GroupSettings, box: Box | None = None) -> bool:
-    """Whether the directions of any two cameras to the middle of the scene are alike enough, and differ enough."""
+def too_far_apart(rig: Rig, settings: GroupSettings, box: Box | None = None) -> bool:
+    """Whether the directions of any two cameras to the middle of the scene differ too much for them to be matched."""
     angles = _angles(rig, _middle(rig, box)[0])[np.triu_indices(len(rig), 1)]
-    return bool(((settings.least_angle <= angles) & (angles <= settings.greatest_angle)).any())
+    return bool((angles > settings.greatest_angle).all())
 
 
 def _middle(rig: Rig, box: Box | None) -> tuple[np.ndarray, bool]:

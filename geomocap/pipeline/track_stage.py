@@ -10,7 +10,7 @@ import numpy as np
 from geomocap.carving.carving_settings import ENCLOSING
 from geomocap.carving.silhouette_views import Undistortion
 from geomocap.dense.dense_settings import CloudSettings
-from geomocap.dense.match_groups import can_be_matched
+from geomocap.dense.match_groups import too_far_apart
 from geomocap.errors import CaptureError
 from geomocap.files.capture import Capture
 from geomocap.files.frame_files import read_points, read_voxels
@@ -23,7 +23,7 @@ from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.patches.point_tracking import track_points
 from geomocap.patches.seeding import image_reduction
-from geomocap.pipeline.cloud_stage import check_images, cloud_settings, clouds
+from geomocap.pipeline.cloud_stage import check_images, clouds
 from geomocap.pipeline.correction_stage import with_cameras
 from geomocap.pipeline.derived import KEYPOINT_FILES
 from geomocap.pipeline.job import Job
@@ -120,8 +120,7 @@ def _on_hull(capture: Capture, settings: CloudSettings) -> bool:
         return True
     if len(capture.rig) < _AROUND:
         return False
-    groups = cloud_settings(settings, capture).groups
-    return not can_be_matched(capture.rig, groups, capture.info.region_of_interest)
+    return too_far_apart(capture.rig, settings.groups, capture.info.region_of_interest)
 
 
 def surface_voxels(points: np.ndarray, size: float) -> Voxels:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from geomocap.dense.dense_frame import CloudFrame, cloud_of_frame
 from geomocap.dense.dense_settings import CloudSettings, GroupSettings, TrustSettings
 from geomocap.dense.match_evidence import MatchEvidence
-from geomocap.dense.match_groups import can_be_matched, match_groups, scene_center
+from geomocap.dense.match_groups import match_groups, scene_center, too_far_apart
 from geomocap.dense.search_bounds import box_depth, hull_depth, inside_silhouettes
 from geomocap.errors import CalibrationError, GeometryError
 from geomocap.model.frame_geometry import Voxels
@@ -231,13 +231,14 @@ def test_groups_that_can_t_be() -> None:
         match_groups(TRIPLET, GroupSettings(template_camera="camX"))
 
 
-def test_cameras_that_can_be_matched() -> None:
+def test_cameras_that_are_too_far_apart() -> None:
     settings = GroupSettings()
-    assert can_be_matched(TRIPLET, settings)
-    assert can_be_matched(ring(8, 360), settings)
-    assert not can_be_matched(ring(3, 360), settings)
-    assert not can_be_matched(TRIPLET, GroupSettings(greatest_angle=15.0, best_angle=10.0))
-    assert not can_be_matched(ring(2, 180), settings)
+    assert too_far_apart(ring(3, 360), settings)
+    assert too_far_apart(ring(2, 180), settings)
+    assert too_far_apart(TRIPLET, GroupSettings(greatest_angle=15.0, best_angle=10.0))
+    assert not too_far_apart(TRIPLET, settings)
+    assert not too_far_apart(ring(3, 4), settings)  # these are too near
+    assert not too_far_apart(ring(8, 360), settings)
 
 
 def turned(rig: Rig, camera: int, degrees: float) -> Rig:
