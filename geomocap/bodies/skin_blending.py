@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from geomocap.bodies.rigid_motions import FEW_POSITIONS
 from geomocap.model.motion_paths import DEPTH_FRACTION
 from geomocap.model.small_systems import solve_symmetric
 from geomocap.scheduling import spread
+
+_FEW_POSITIONS = 20_000  # that are not worth waking other threads for
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,7 @@ def places_at_rest(
     """
     places = np.zeros((len(samples), 3))
     arrays = _arrays(positions, weights, ray, rotations, translations)
-    few = len(samples) if len(samples) * weights.shape[1] < FEW_POSITIONS else 1
+    few = len(samples) if len(samples) * weights.shape[1] < _FEW_POSITIONS else 1
     spread(_places_at_rest, len(samples), samples, label, *arrays, places, few=few)
     return places
 
@@ -323,7 +324,7 @@ def explain(
         blends.costs,
         blends.partner,
         blends.fraction,
-        few=len(weights) if weights.size < FEW_POSITIONS else 1,
+        few=len(weights) if weights.size < _FEW_POSITIONS else 1,
     )
     return blends
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from geomocap.bodies.connected_linkage import connected_linkage
 from geomocap.bodies.local_rotations import local_rotations, turn_distances
-from geomocap.bodies.rigid_motions import _step_equations, fit_rigid_motion
+from geomocap.bodies.rigid_motions import _in_blocks, _step_equations, fit_rigid_motion
 from geomocap.bodies.skin_blending import blend_spans, explain, places_at_rest
 from geomocap.bodies.surface_graph import bridges, lasting_distances, surface_graph
 from geomocap.model.motion_paths import DEPTH_FRACTION, sure_part, within_ray
@@ -231,14 +231,22 @@ def test_a_motion_with_rays_is_the_least_squares_one():
 
 def test_equations_of_a_motion_with_rays_are_those_of_their_jacobian():
     rng = np.random.default_rng(12)
-    n, T = 7, 4
+    n, T = 7, 19  # frames of two blocks
     rotations = Rotation.from_rotvec(rng.normal(size=(T, 3))).as_matrix()
     translations, positions = rng.normal(size=(T, 3)), rng.normal(size=(n, T, 3))
     rest, weights, ray = rng.normal(size=(n, 3)), rng.random((n, T)), rng.normal(size=(n, T, 3))
     ray /= np.linalg.norm(ray, axis=2, keepdims=True)
-    middle, normal, right = np.zeros((T, 3)), np.zeros((T, 6, 6)), np.zeros((T, 6))
-    for begin, end in ((0, 1), (1, 4)):
-        _step_equations(begin, end, rotations, translations, positions, rest, weights, ray, middle, normal, right)
+    known, weight, motion = _in_blocks(positions, weights, ray)
+    motion = np.zeros((12, 16 * len(motion)))
+    motion[:, :T] = np.concatenate([rotations.reshape(T, 9), translations], axis=1).T
+    found = [
+        _step_equations(known[b], rest, weight[b], np.ascontiguousarray(motion[:, 16 * b : 16 * b + 16]))
+        for b in range(len(known))
+    ]
+    sums = np.concatenate(found, axis=1)[:, :T].T
+    normal, right, middle = np.zeros((T, 6, 6)), sums[:, :6].copy(), sums[:, 27:30]
+    rows, columns = np.tril_indices(6)
+    normal[:, rows, columns] = normal[:, columns, rows] = sums[:, 6:27]
     for t in range(T):
         turned = rest @ rotations[t].T
         expected = np.average(turned, axis=0, weights=weights[:, t])
