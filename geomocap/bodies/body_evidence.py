@@ -120,6 +120,7 @@ def judge(
         Turns that are known already; what is found is added.
     """
     contacts, turns = model.contacts(evidence.adjacency), {} if turns is None else turns
+    evidence = replace(evidence, weights=np.where(evidence.seen, evidence.weights, 0.0))  # gaps are filled by guesses
     return {b: _judge(b, model, evidence, criterion, contacts, turns) for b in bodies}
 
 
@@ -171,19 +172,18 @@ def _explained(
     others = np.argsort(-reached, kind="stable")[: min(_MOST_NEIGHBOURS, int((reached > 0).sum()))]
     allowed = np.zeros((len(some), model.count), bool)
     allowed[:, others] = True
-    beside = np.zeros((model.count, model.count), bool)
-    beside[np.ix_(neighbours, neighbours)] = True
-    evidence = replace(evidence, weights=np.where(evidence.seen, evidence.weights, 0.0))  # gaps are filled by guesses
-    without = evidence.explain(some, model, allowed, beside, 0.0)
-    row, main = np.arange(len(some)), without.costs.argmin(axis=1)
-    missed, partner, fraction = without.costs[row, main], without.partner[row, main], without.fraction[row, main]
     allowed[:, body] = True
-    with_it = np.zeros_like(beside)
-    with_it[body] = with_it[:, body] = True
-    own = evidence.explain(some, model, allowed, with_it, 0.0).costs[:, body]
+    blended = np.zeros((model.count, model.count), bool)
+    blended[np.ix_(neighbours, neighbours)] = True
+    blended[body] = True
+    found = evidence.explain(some, model, allowed, blended, 0.0)
+    own = found.costs[:, body].copy()
+    found.costs[:, body] = np.inf  # without it
+    row, main = np.arange(len(some)), found.costs.argmin(axis=1)
+    missed, partner, fraction = found.costs[row, main], found.partner[row, main], found.fraction[row, main]
     stated = 3.0 * evidence.sigma[some] ** 2
     if evidence.ray is not None:  # what one camera alone sees is as unsure as its depth says, which hardly counts
-        stated[evidence.ray[some].any(axis=(1, 2))] = 0.0
+        stated[evidence.lone[some].any(axis=1)] = 0.0
     noise = np.maximum(criterion.noise.variance, stated)
     if criterion.softness > 0:
         apart = _spans(some, main, partner, model, evidence)
@@ -221,7 +221,7 @@ def _directions(members: np.ndarray, evidence: Evidence) -> float:
     if evidence.ray is None:
         return 3.0
     seen = evidence.seen[members]
-    return 3.0 - float((evidence.ray[members].any(axis=2) & seen).sum() / max(seen.sum(), 1))
+    return 3.0 - float((evidence.lone[members] & seen).sum() / max(seen.sum(), 1))
 
 
 def _turn(first: int, second: int, model: BodyModel, evidence: Evidence) -> float:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.sparse import csr_matrix
 
 from geomocap.bodies.rigid_motions import fit_rigid_motion
 from geomocap.bodies.skin_blending import Blends, explain, places_at_rest
+from geomocap.scheduling import map_here
 
 _LEAST_CONTACTS = 3
 _LEAST_FRACTION = 0.3
@@ -33,6 +34,8 @@ class Evidence:
         Standard deviation of the positions as their source states it; 0: not stated.
     ray : (N, T, 3) float, optional
         Directions along which positions are unsure, see `MotionPaths`.
+    lone : (N, T) bool
+        Where there are such directions: one camera alone sees the sample.
     rest : (N, 3) float, metres
         Positions in the reference.
     certain : (N,) bool
@@ -60,6 +63,7 @@ class Evidence:
     seen: np.ndarray
     sigma: np.ndarray
     ray: np.ndarray | None
+    lone: np.ndarray
     rest: np.ndarray
     certain: np.ndarray
     turns: np.ndarray
@@ -76,7 +80,7 @@ class Evidence:
         """What each sample counts in the size of a body, (N,) float: less where one camera alone sees it."""
         if self.ray is None:
             return np.ones(len(self.rest))
-        alone = (self.ray.any(axis=2) & self.seen).sum(axis=1) / np.maximum(self.seen.sum(axis=1), 1)
+        alone = (self.lone & self.seen).sum(axis=1) / np.maximum(self.seen.sum(axis=1), 1)
         return 1.0 - (1.0 - _BY_ONE) * alone
 
     def with_places_open(self) -> Evidence:
@@ -86,13 +90,14 @@ class Evidence:
     def explain(
         self, samples: np.ndarray, model: BodyModel, allowed: np.ndarray, adjacent: np.ndarray, penalty: float
     ) -> Blends:
-        """Explain some samples by allowed bodies, (n, B) bool, and blends of adjacent ones, (B, B) bool."""
+        """Explain some samples by allowed bodies, (n, B) bool, and blends of some with some, (B, B) bool."""
         return explain(
-            self.positions[samples],
-            self.weights[samples],
-            None if self.ray is None else self.ray[samples],
-            self.rest[samples],
-            self.certain[samples],
+            samples,
+            self.positions,
+            self.weights,
+            self.ray,
+            self.rest,
+            self.certain,
             model.rotations,
             model.translations,
             allowed,
@@ -193,26 +198,50 @@ def refit(model: BodyModel, evidence: Evidence, bodies: np.ndarray) -> BodyModel
     weight w². So the soft samples tell how far a body turns too, instead of pulling its motion towards its neighbours'.
     """
     rotations, translations = model.rotations.copy(), model.translations.copy()
-    for b in bodies:
-        mine = np.flatnonzero(model.label == b)
-        if not len(mine):
-            continue
-        shared = np.flatnonzero((model.partner == b) & (1.0 - model.fraction > _LEAST_FRACTION))
-        members = np.concatenate([mine, shared])
-        part = np.concatenate([model.fraction[mine], 1.0 - model.fraction[shared]])
-        other = np.concatenate([model.partner[mine], model.label[shared]])
-        seen = evidence.positions[members].copy()
-        rest = evidence.rest[members]
-        for q in np.unique(other[(other >= 0) & (part < 1.0)]):
-            of = np.flatnonzero((other == q) & (part < 1.0))
-            w = part[of][:, None, None]
-            carried = carry(rotations[q], translations[q], rest[of])
-            seen[of] = (seen[of] - (1.0 - w) * carried) / w
-        weights = evidence.weights[members] * (part**2)[:, None]
-        rotations[b], translations[b], _ = fit_rigid_motion(
-            seen, rest, weights, evidence.noise, ray=None if evidence.ray is None else evidence.ray[members]
-        )
+    fit = partial(_fit_body, model, evidence, rotations, translations)
+    for wave in _waves(model, bodies):
+        for b, motion in zip(wave, map_here(fit, wave), strict=True):
+            if motion is not None:
+                rotations[b], translations[b] = motion
     return replace(model, rotations=rotations, translations=translations)
+
+
+def _waves(model: BodyModel, bodies: np.ndarray) -> list[list[int]]:
+    """Bodies in groups to be fitted at once, of which none blends with another: as if one after another in their order.
+
+    Each comes after those before it that it blends with, and before those after it.
+    """
+    blended = (model.partner >= 0) & (model.fraction < 1.0)
+    linked = np.zeros((model.count, model.count), bool)
+    linked[model.label[blended], model.partner[blended]] = True
+    linked |= linked.T
+    depth = np.zeros(model.count, int)  # of those not yet reached 0
+    for b in bodies:
+        depth[b] = 1 + depth[linked[b]].max(initial=0)
+    return [[int(b) for b in bodies if depth[b] == k] for k in range(1, depth.max(initial=0) + 1)]
+
+
+def _fit_body(
+    model: BodyModel, evidence: Evidence, rotations: np.ndarray, translations: np.ndarray, b: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Motion of one body, (T, 3, 3), (T, 3), given those of all, see `refit`; None if it has no samples."""
+    mine = np.flatnonzero(model.label == b)
+    if not len(mine):
+        return None
+    shared = np.flatnonzero((model.partner == b) & (1.0 - model.fraction > _LEAST_FRACTION))
+    members = np.concatenate([mine, shared])
+    part = np.concatenate([model.fraction[mine], 1.0 - model.fraction[shared]])
+    other = np.concatenate([model.partner[mine], model.label[shared]])
+    seen = evidence.positions[members]
+    rest = evidence.rest[members]
+    for q in np.unique(other[(other >= 0) & (part < 1.0)]):
+        of = np.flatnonzero((other == q) & (part < 1.0))
+        w = part[of][:, None, None]
+        carried = carry(rotations[q], translations[q], rest[of])
+        seen[of] = (seen[of] - (1.0 - w) * carried) / w
+    weights = evidence.weights[members] * (part**2)[:, None]
+    ray = None if evidence.ray is None else evidence.ray[members]
+    return fit_rigid_motion(seen, rest, weights, evidence.noise, ray=ray)[:2]
 
 
 def settle_rest(model: BodyModel, evidence: Evidence) -> Evidence:

@@ -49,11 +49,9 @@ class SurfaceGraph:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _distances_of(i, positions, rank, result):
-    """Fill row i."""
+    """Fill row i and column i as far as the diagonal."""
     best = np.empty(rank)
-    for j in range(len(positions)):
-        if j == i:
-            continue
+    for j in range(i):
         best[:] = 0.0
         for t in range(positions.shape[1]):
             x = positions[i, t, 0] - positions[j, t, 0]
@@ -66,7 +64,7 @@ def _distances_of(i, positions, rank, result):
                     best[k] = best[k + 1]
                     k += 1
                 best[k] = square
-        result[i, j] = np.sqrt(best[0])
+        result[i, j] = result[j, i] = np.sqrt(best[0])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -273,7 +273,7 @@ def test_blends_with_rays_are_those_of_a_search():
     positions = 0.7 * carried[:, 0] + 0.3 * carried[:, 1] + rng.normal(scale=0.02, size=(3, 5, 1)) * ray
     everything = np.ones((3, 2), bool), np.ones((2, 2), bool)
     of = (positions, weights, ray, rest)
-    blends = explain(*of, np.ones(3, bool), rotations, translations, *everything, 0.01, 10.0)
+    blends = explain(np.arange(3), *of, np.ones(3, bool), rotations, translations, *everything, 0.01, 10.0)
     for i in range(3):
         fractions = np.linspace(0.5, 1.0, 2001)[:, None, None]
         miss = sure_part(fractions * carried[i, 0] + (1 - fractions) * carried[i, 1] - positions[i], ray[i])
@@ -282,7 +282,17 @@ def test_blends_with_rays_are_those_of_a_search():
         assert blends.costs[i, 0] == pytest.approx(costs.min(), rel=1e-3)
         assert blends.fraction[i, 0] == pytest.approx(w[costs.argmin()], abs=2e-3)
     # a sample whose place at rest is open gets the one that fits best
-    alone = explain(*of, np.zeros(3, bool), rotations, translations, *everything[:1], np.zeros((2, 2), bool), 0.0, 10.0)
+    alone = explain(
+        np.arange(3),
+        *of,
+        np.zeros(3, bool),
+        rotations,
+        translations,
+        *everything[:1],
+        np.zeros((2, 2), bool),
+        0.0,
+        10.0,
+    )
 
     def misses(place: np.ndarray) -> np.ndarray:
         there = rotations[1] @ place + translations[1]
@@ -303,7 +313,17 @@ def test_blends_are_those_of_a_search_over_weights():
     penalty = 0.02
     everything = np.ones((4, 3), bool), np.ones((3, 3), bool)
     blends = explain(
-        positions, weights, None, rest, np.ones(4, bool), rotations, translations, *everything, penalty, 10.0
+        np.arange(4),
+        positions,
+        weights,
+        None,
+        rest,
+        np.ones(4, bool),
+        rotations,
+        translations,
+        *everything,
+        penalty,
+        10.0,
     )
     for i in range(4):
         best = {}
@@ -319,6 +339,50 @@ def test_blends_are_those_of_a_search_over_weights():
         assert main == min(best, key=lambda a: best[a])
         assert blends.costs[i, main] == pytest.approx(best[main][0], rel=1e-3, abs=1e-9)
         assert blends.fraction[i, main] == pytest.approx(best[main][1], abs=2e-3)
+
+
+@pytest.mark.parametrize("rays", [False, True])
+def test_samples_are_explained_as_with_whole_arrays(rays):
+    positions, rest, weights, ray = loose_body(40, 45)
+    ray, rng = ray if rays else np.zeros_like(positions), np.random.default_rng(18)
+    rotations = Rotation.from_rotvec(rng.normal(scale=0.1, size=(180, 3))).as_matrix().reshape(4, 45, 3, 3)
+    translations, certain = rng.normal(scale=0.02, size=(4, 45, 3)), rng.random(40) < 0.5
+    positions = np.einsum("nb,bnti->nti", rng.dirichlet(np.ones(4), 40), _carried(rotations, translations, rest))
+    samples = rng.permutation(40)[:37]
+    allowed, adjacent = rng.random((37, 4)) < 0.8, rng.random((4, 4)) < 0.6
+    penalty, cap = 0.005, 0.05
+    given = positions, weights, ray if rays else None, rest, certain, rotations, translations
+    found = explain(samples, *given, allowed, adjacent, penalty, cap)
+    for row, n in enumerate(samples):
+        known = positions, weights, ray if rays else None, rotations, translations
+        places = np.tile(rest[n], (4, 1))
+        if not certain[n]:
+            places = np.concatenate([places_at_rest(np.array([n]), np.full(40, b), *known) for b in range(4)])
+        carried = np.einsum("btij,bj->bti", rotations, places) + translations
+        miss, share = sure_part(positions[n] - carried, ray[n]), weights[n] / weights[n].sum()
+
+        def cost(missed, share=share):
+            return share @ np.minimum((missed**2).sum(axis=1), cap**2)
+
+        for a in range(4):
+            best, partner, fraction = (cost(miss[a]), -1, 1.0) if allowed[row, a] else (np.inf, -1, 1.0)
+            for b in np.flatnonzero(adjacent[a] & allowed[row] & allowed[row, a] & (np.arange(4) != a)):
+                apart = miss[b] - miss[a]
+                curve = share @ (apart**2).sum(axis=1) - 4 * penalty**2
+                w = (share @ (miss[b] * apart).sum(axis=1) - 2 * penalty**2) / curve
+                if curve <= 0 or not 0.5 <= w < 1:
+                    continue
+                blended = cost(w * miss[a] + (1 - w) * miss[b]) + 4 * w * (1 - w) * penalty**2
+                if blended < best:
+                    best, partner, fraction = blended, b, w
+            np.testing.assert_allclose(found.costs[row, a], best, rtol=1e-8)
+            assert found.partner[row, a] == partner
+            np.testing.assert_allclose(found.fraction[row, a], fraction, rtol=1e-8)
+
+
+def _carried(rotations: np.ndarray, translations: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Places (n, 3) carried by bodies, (B, n, T, 3)."""
+    return np.einsum("btij,nj->bnti", rotations, rest) + translations[:, None]
 
 
 def test_bridges_are_the_relative_neighbours():
