@@ -110,16 +110,34 @@ def surface_noise(
 
 def _correlation(misses: np.ndarray, places: np.ndarray, step: float) -> np.ndarray:
     """Mean cosine of misses (n, M) of pairs of samples by their distance, (K,), 0 from its first zero on."""
-    length = np.linalg.norm(misses, axis=1) + 1e-12
-    cosines = (misses @ misses.T) / np.outer(length, length)
-    apart = np.linalg.norm(places[:, None] - places[None], axis=2)
-    pairs = np.triu_indices(len(misses), 1)
-    bins = np.minimum((apart[pairs] / step).astype(int), _BINS - 1)
-    number = np.bincount(bins, minlength=_BINS)
-    mean = np.bincount(bins, cosines[pairs], _BINS) / np.maximum(number, 1)
+    total, number = np.zeros(_BINS), np.zeros(_BINS, np.int64)
+    correlation_sums(misses @ misses.T, np.linalg.norm(misses, axis=1) + 1e-12, places, step, total, number)
+    mean = total / np.maximum(number, 1)
     over = np.flatnonzero((mean <= 0) & (number > 0))
     mean[over[0] if len(over) else _BINS - 1 :] = 0.0
     return np.clip(mean, 0.0, 1.0)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def correlation_sums(products, length, places, step, total, number):
+    """Add up the cosines of pairs of samples by their distance, (K,), and their number.
+
+    Parameters
+    ----------
+    products : (n, n) float
+        Of the misses of two samples.
+    length : (n,) float
+    places : (n, 3) float, metres
+    step : float, metres
+    total, number : (K,) float, (K,) int
+        Added to; the last one is of all farther pairs, too.
+    """
+    for i in range(len(length)):
+        for j in range(i + 1, len(length)):
+            x, y, z = places[i, 0] - places[j, 0], places[i, 1] - places[j, 1], places[i, 2] - places[j, 2]
+            k = min(int(np.sqrt(x * x + y * y + z * z) / step), len(total) - 1)
+            total[k] += products[i, j] / (length[i] * length[j])
+            number[k] += 1
 
 
 def _miss_across(

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from geomocap.model.even_choice import evenly_chosen
 from geomocap.model.motion_paths import MotionPaths
-from geomocap.scheduling import spread
+from geomocap.scheduling import map_here, spread
 
 _COMPANIONS = 48  # of those, mostly few are seen where a sample is not
 _CANDIDATES = 24
@@ -184,11 +184,11 @@ def complete_tracks(paths: MotionPaths) -> tuple[np.ndarray, np.ndarray]:
     nearest = np.maximum(np.where(np.isfinite(costs[:, :1]), costs[:, :1], 1.0), 1e-12)  # 1: of itself alone
     shares = (nearest / np.maximum(costs, nearest)) ** _STEEPNESS
     frames = paths.frames
-    forward = np.arange(frames)
+    forward, backward = np.arange(frames), np.arange(frames)[::-1].copy()
     fade = 0.9
     given = seen.astype(float)
-    ahead, sure_ahead = _carry_on(start, seen, given, companions, shares, forward, fade)
-    back, sure_back = _carry_on(start, seen, given, companions, shares, forward[::-1].copy(), fade)
+    ways = map_here(lambda order: _carry_on(start, seen, given, companions, shares, order, fade), [forward, backward])
+    (ahead, sure_ahead), (back, sure_back) = ways
     # samples that were filled in one direction only help to fill the rest in the other
     total = sure_ahead + sure_back
     known = total > 0
@@ -197,7 +197,7 @@ def complete_tracks(paths: MotionPaths) -> tuple[np.ndarray, np.ndarray]:
     certainty = np.where(seen, 1.0, np.maximum(sure_ahead, sure_back))
     if not known.all():
         ahead, sure_ahead = _carry_on(filled, known, certainty, companions, shares, forward, fade)
-        filled, certainty = _carry_on(ahead, sure_ahead > 0, sure_ahead, companions, shares, forward[::-1].copy(), fade)
+        filled, certainty = _carry_on(ahead, sure_ahead > 0, sure_ahead, companions, shares, backward, fade)
     lost = certainty <= 0
     if lost.any():
         filled = _stand_still(filled, ~lost)

@@ -10,6 +10,7 @@ from geomocap.bodies.local_rotations import local_rotations, turn_distances
 from geomocap.bodies.rigid_motions import _in_blocks, _step_equations, fit_rigid_motion
 from geomocap.bodies.skin_blending import blend_spans, explain, places_at_rest
 from geomocap.bodies.surface_graph import bridges, lasting_distances, surface_graph
+from geomocap.bodies.surface_noise import correlation_sums
 from geomocap.model.motion_paths import DEPTH_FRACTION, sure_part, within_ray
 from geomocap.model.rotations import nearest_rotation, rigid_motion, turn_angles
 
@@ -383,6 +384,19 @@ def test_samples_are_explained_as_with_whole_arrays(rays):
 def _carried(rotations: np.ndarray, translations: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """Places (n, 3) carried by bodies, (B, n, T, 3)."""
     return np.einsum("btij,nj->bnti", rotations, rest) + translations[:, None]
+
+
+def test_correlations_are_sums_over_pairs_by_distance():
+    rng = np.random.default_rng(19)
+    misses, places = rng.normal(size=(30, 7)), rng.normal(size=(30, 3))
+    length = np.linalg.norm(misses, axis=1)
+    total, number = np.zeros(8), np.zeros(8, np.int64)
+    correlation_sums(misses @ misses.T, length, places, 0.4, total, number)
+    pairs = np.triu_indices(30, 1)
+    bins = np.minimum((np.linalg.norm(places[:, None] - places, axis=2)[pairs] / 0.4).astype(int), 7)
+    cosines = (misses @ misses.T / np.outer(length, length))[pairs]
+    np.testing.assert_array_equal(number, np.bincount(bins, minlength=8))
+    np.testing.assert_array_equal(total, np.bincount(bins, cosines, 8))
 
 
 def test_bridges_are_the_relative_neighbours():
