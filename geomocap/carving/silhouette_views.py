@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from geomocap.model.rig import Rig
 BORDER = 3  # a silhouette that comes as near as this to the border of the image reaches it (pixels)
 LEAST_CUT = 3  # if so many of its pixels do
 _WHOLE = np.empty((0, 0), np.uint16)  # parts of a pixel, as `cv2.remap` wants them: none
+_TILE = 32  # pixels
 SPECK = 0.01  # of the area that silhouettes have
 
 
@@ -149,10 +151,34 @@ class Undistortion:
         C, H, W = self.valid.shape
         flat = np.zeros((C, H, W), np.uint8)
         for c, (mask, source) in enumerate(zip(masks, self.sources, strict=True)):
-            h, w = source.shape[:2]
-            flat[c, :h, :w] = cv2.remap((mask != 0).view(np.uint8), source, _WHOLE, cv2.INTER_NEAREST)
-        flat &= self.valid
+            subject = (mask != 0).view(np.uint8)
+            box = self._box(c, subject)
+            if source[box].size > 0:
+                flat[(c, *box)] = cv2.remap(subject, source[box], _WHOLE, cv2.INTER_NEAREST)
+                flat[(c, *box)] &= self.valid[(c, *box)]
         return PinholeViews(self.names, self.projections, flat, self.valid)
+
+    @cached_property
+    def _reaches(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+        """Least and largest column and row that the seen pixels of each tile come from, (rows, columns, 2) int16."""
+        found = []
+        for source, valid in zip(self.sources, self.valid, strict=True):
+            height, width = source.shape[:2]
+            seen = valid[:height, :width, None] != 0
+            rows, columns = np.arange(0, height, _TILE), np.arange(0, width, _TILE)
+            least = np.minimum.reduceat(np.where(seen, source, np.int16(2**15 - 1)), rows)
+            largest = np.maximum.reduceat(np.where(seen, source, np.int16(-1)), rows)
+            found.append((np.minimum.reduceat(least, columns, axis=1), np.maximum.reduceat(largest, columns, axis=1)))
+        return tuple(found)
+
+    def _box(self, camera: int, subject: np.ndarray) -> tuple[slice, slice]:
+        """Rows and columns of the tiles that may come from the subject, (H_c, W_c) uint8, in the original image."""
+        x, y, w, h = cv2.boundingRect(subject)
+        least, largest = self._reaches[camera]
+        touched = ((largest >= (x, y)) & (least < (x + w, y + h))).all(axis=2).view(np.uint8)
+        x, y, w, h = (int(n) * _TILE for n in cv2.boundingRect(touched))
+        height, width = self.sources[camera].shape[:2]
+        return slice(y, min(y + h, height)), slice(x, min(x + w, width))
 
     def images(self, images: Sequence[np.ndarray], of_subject: PinholeViews | None = None) -> np.ndarray:
         """Undistort the images (H_c, W_c, 3) of one frame, bilinear: (C, H, W, 3) uint8.

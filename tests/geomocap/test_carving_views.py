@@ -59,6 +59,19 @@ def test_distorted_masks_say_the_same_of_points_as_the_original(k1):
     assert not views.valid[0, row, column].any() and not views.masks[0, row, column].any()
 
 
+@pytest.mark.parametrize("k1", [-0.25, 0.2])
+def test_small_silhouettes_are_undistorted_as_parts_of_whole_images(k1):
+    undistortion = Undistortion.of(rig((160, 120, [140, 142, 82, 59, k1, 0.03, 0.002, -0.001])))
+    source, valid = undistortion.sources[0], undistortion.valid[0]
+    for y, x in ((0, 0), (50, 70), (100, 140)):
+        mask = np.zeros((120, 160), np.uint8)
+        mask[y : y + 20, x : x + 20] = 255
+        expected = (mask[source[..., 1], source[..., 0]] != 0) & (valid != 0)
+        assert expected.any()
+        np.testing.assert_array_equal(undistortion.views([mask]).masks[0], expected)
+    assert not undistortion.views([np.zeros((120, 160), np.uint8)]).masks.any()
+
+
 def test_half_a_pixel_is_noticed():
     """The columns where a vertical edge comes out average to where it is, far better than half a pixel."""
     r = rig((160, 120, [140, 140, 80, 60, -0.2, 0, 0, 0]))
