@@ -175,7 +175,7 @@ class Undistortion:
         """Rows and columns of the tiles that may come from the subject, (H_c, W_c) uint8, in the original image."""
         x, y, w, h = cv2.boundingRect(subject)
         least, largest = self._reaches[camera]
-        touched = ((largest >= (x, y)) & (least < (x + w, y + h))).all(axis=2).view(np.uint8)
+        touched = np.asarray(((largest >= (x, y)) & (least < (x + w, y + h))).all(axis=2), np.uint8)
         x, y, w, h = (int(n) * _TILE for n in cv2.boundingRect(touched))
         height, width = self.sources[camera].shape[:2]
         return slice(y, min(y + h, height)), slice(x, min(x + w, width))
