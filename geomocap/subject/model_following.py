@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -146,14 +147,14 @@ def fit_motion(
     settings = settings or FollowingSettings()
     frames = start.frames
     sequence = _Sequence.of(model, read, frames, spacing, settings)
-    first = int(np.argmin([sequence.misfit(start.part(slice(t, t + 1)), t) for t in range(frames)]))
+    first = int(np.argmin(map_here(lambda t: sequence.misfit(start.part(slice(t, t + 1)), t), range(frames))))
     pieces = {first: sequence.fitted(start.part(slice(first, first + 1)), first)}
     for order in (range(first + 1, frames), range(first - 1, -1, -1)):
         for t in order:
             back = 1 if order.step > 0 else -1
             starts = (start.part(slice(t, t + 1)), _carried_on(pieces[t - back], pieces.get(t - 2 * back)))
-            tried = [sequence.fitted(pose, t) for pose in starts]
-            pieces[t] = tried[int(np.argmin([sequence.misfit(pose, t) for pose in tried]))]
+            tried = map_here(partial(sequence.fitted_with_misfit, frame=t), starts)
+            pieces[t] = min(tried, key=lambda one: one[1])[0]
             progress(_STAGE, len(pieces), frames + 1)
     return sequence.fitted_together(pieces, paths, first, progress)
 
@@ -196,6 +197,11 @@ class _Sequence:
         prior = PosePrior(expected, np.deg2rad(s.turn_deg), np.deg2rad(2 * s.turn_deg), self.model.diagonal)
         view = [self.views[frame]]
         return fit_pose(self.model.linkage, expected, self.surface, view, self.scales, prior, s.steps)
+
+    def fitted_with_misfit(self, expected: JointMotion, frame: int) -> tuple[JointMotion, float]:
+        """The same, and by what it misses the surface."""
+        pose = self.fitted(expected, frame)
+        return pose, self.misfit(pose, frame)
 
     def misfit(self, pose: JointMotion, frame: int) -> float:
         """By what a pose misses a frame's surface."""
@@ -249,8 +255,11 @@ def _through(sequence: _Sequence, pieces: dict[int, JointMotion], order: range, 
         starts = [(h, h.expected) for h in beam]
         if count > 1:
             starts.append((beam[0], _seen_pose(sequence, beam[0].expected, t)))
-        fitted = [(h, sequence.fitted(pose, t)) for h, pose in starts]
-        found = [_Hypothesis(pose, h, h.cost + (sequence.misfit(pose, t) if count > 1 else 0.0)) for h, pose in fitted]
+        if count > 1:
+            tried = map_here(partial(sequence.fitted_with_misfit, frame=t), [pose for _, pose in starts])
+        else:
+            tried = [(sequence.fitted(starts[0][1], t), 0.0)]
+        found = [_Hypothesis(pose, h, h.cost + miss) for (h, _), (pose, miss) in zip(starts, tried, strict=True)]
         beam = []
         for one in sorted(found, key=lambda h: h.cost):
             if len(beam) < count and all(_differ(one.pose, other.pose) for other in beam):

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from geomocap.bodies.rigid_motions import fit_rigid_motion
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.rotations import nearest_rotation, turn_angles
+from geomocap.scheduling import map_here
 from geomocap.skeleton.body_observations import SkinPoints
 from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, joint_motion
 from geomocap.subject.subject_model import SubjectModel
@@ -45,7 +46,8 @@ def attach_paths(model: SubjectModel, bodies: BodyMotion, paths: MotionPaths, re
     nearest = proposed[:, 0].copy()
     least = np.full(paths.count, np.inf)
     target = np.where(seen[..., None], paths.positions, 0.0).swapaxes(0, 1)
-    for column in proposed.T:
+
+    def carried_back(column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         owners, fractions = skin.bodies[column], skin.fractions[column]
         matrix, offset = np.zeros((len(bodies.rotations), paths.count, 3, 3)), 0.0
         for k in range(owners.shape[1]):
@@ -56,7 +58,9 @@ def attach_paths(model: SubjectModel, bodies: BodyMotion, paths: MotionPaths, re
         place = np.nanmedian(back, axis=1)
         spread = np.nanmedian(np.linalg.norm(back - place[:, None], axis=2), axis=1)
         # far from the model's surface is as bad as off the path
-        cost = spread + np.linalg.norm(place - skin.rest[column], axis=1)
+        return place, spread + np.linalg.norm(place - skin.rest[column], axis=1)
+
+    for column, (place, cost) in zip(proposed.T, map_here(carried_back, list(proposed.T)), strict=True):
         better = cost < least
         least[better], nearest[better], rest[better] = cost[better], column[better], place[better]
     far = np.linalg.norm(rest - skin.rest[nearest], axis=1) > reach
@@ -70,10 +74,13 @@ def _nearest_points(skin: SkinPoints, bodies: BodyMotion, paths: MotionPaths) ->
         frames = np.flatnonzero(row)
         asked[path] = frames[np.linspace(0, len(frames) - 1, _LOOKS).round().astype(int)]
     nearest = np.empty_like(asked)
-    for t in np.unique(asked):
+
+    def look(t: int) -> None:
         n, k = np.nonzero(asked == t)
         placed = bodies.part(slice(t, t + 1)).carry(skin.rest, skin.bodies, skin.fractions)[0]
         nearest[n, k] = cKDTree(placed).query(paths.positions[n, t])[1]
+
+    map_here(look, np.unique(asked).tolist())
     return nearest
 
 
