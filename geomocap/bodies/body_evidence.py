@@ -120,7 +120,8 @@ def judge(
         Turns that are known already; what is found is added.
     """
     contacts, turns = model.contacts(evidence.adjacency), {} if turns is None else turns
-    evidence = replace(evidence, weights=np.where(evidence.seen, evidence.weights, 0.0))  # gaps are filled by guesses
+    seen_alone = np.ascontiguousarray(np.where(evidence.seen, evidence.weights, 0.0))  # gaps are filled by guesses
+    evidence = replace(evidence, weights=seen_alone)
     return {b: _judge(b, model, evidence, criterion, contacts, turns) for b in bodies}
 
 

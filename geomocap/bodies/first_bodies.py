@@ -59,7 +59,7 @@ def first_bodies(
     settings : MotionBodiesSettings
     """
     diagonal = paths.diagonal
-    weights = np.where(paths.seen, paths.weights(), 0.1 * certainty)
+    weights = np.ascontiguousarray(np.where(paths.seen, paths.weights(), 0.1 * certainty))
     smooth = smooth_paths(positions)
     reference = smooth[:, 0]  # of samples that are not seen there, as their neighbours carry them back
     graph = surface_graph(smooth, reference, settings.neighbours, settings.max_stretch)

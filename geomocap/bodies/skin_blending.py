@@ -425,7 +425,7 @@ def _arrays(
 ) -> tuple[np.ndarray, ...]:
     """The same as kernels take them; (N, 0, 3): no rays."""
     ray = np.zeros((len(weights), 0, 3)) if ray is None else ray
-    positions, ray, rotations, translations = (
-        np.ascontiguousarray(a, float) for a in (positions, ray, rotations, translations)
+    positions, weights, ray, rotations, translations = (
+        np.ascontiguousarray(a, float) for a in (positions, weights, ray, rotations, translations)
     )
     return positions, weights, ray, rotations, translations
