@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.spatial import cKDTree
 
-from geomocap.model.motion_paths import DEPTH_FRACTION, sure_part
+from geomocap.model.fused import turned
+from geomocap.model.motion_paths import DEPTH_FRACTION
 from geomocap.model.rotations import nearest_rotation
 from geomocap.nodes.node_graph import NodeGraph
 
@@ -134,22 +136,75 @@ class AnchorPoints:
         scale : float
             Distance at which a mark loses its weight, metres.
         """
-        y, turn = carried(graph, self.sample, x, R)
-        error = y - self.position - np.einsum("kij,kj->ki", turn, self.offset)
-        miss = sure_part(error, self.ray)
-        w = weight * self.precision / (1 + (miss**2).sum(axis=1) / scale**2) ** 2
-        pull = np.broadcast_to(np.eye(3), (len(w), 3, 3))
-        if self.ray is not None:
-            pull = pull - (1 - DEPTH_FRACTION**2) * self.ray[:, :, None] * self.ray[:, None]
-        np.add.at(A, self.sample, w[:, None, None] * pull)
-        np.add.at(b, self.sample, w[:, None] * np.einsum("kij,kj->ki", pull, error))
+        rays = np.zeros((0, 3)) if self.ray is None else self.ray
+        pull_marks(
+            A,
+            b,
+            self.sample,
+            self.offset,
+            self.position,
+            self.precision,
+            rays,
+            x,
+            R,
+            graph.binding,
+            graph.weights,
+            graph.offsets,
+            weight,
+            scale**2,
+        )
 
 
 def carried(graph: NodeGraph, sample: np.ndarray, x: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Places (K, 3) and turns (K, 3, 3) of some samples; the turns are blends and no exact rotations."""
-    w, nodes = graph.weights[sample], graph.binding[sample]
-    y = (w[..., None] * (x[nodes] + np.matmul(R[nodes], graph.offsets[sample][..., None])[..., 0])).sum(axis=1)
-    return y, (w[..., None, None] * R[nodes]).sum(axis=1)
+    places, turns = np.empty((len(sample), 3)), np.empty((len(sample), 3, 3))
+    carry(sample, x, R, graph.binding, graph.weights, graph.offsets, places, turns)
+    return places, turns
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def carry(sample, x, R, binding, weights, offsets, places, turns):
+    """Fill the places (K, 3) and turns (K, 3, 3) of samples (K,), see `carried`."""
+    for k in range(len(sample)):
+        s = sample[k]
+        places[k], turns[k] = 0.0, 0.0
+        for h in range(binding.shape[1]):
+            i, w = binding[s, h], weights[s, h]
+            o0, o1, o2 = offsets[s, h, 0], offsets[s, h, 1], offsets[s, h, 2]
+            for m in range(3):
+                places[k, m] += w * (x[i, m] + turned(R[i], m, o0, o1, o2))
+                for n in range(3):
+                    turns[k, m, n] += w * R[i, m, n]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def pull_marks(A, b, sample, offset, position, precision, ray, x, R, binding, weights, offsets, weight, scale_square):
+    """Add what marks pull to A (S, 3, 3) and b (S, 3), see `AnchorPoints.add_to`; without rays `ray` has no rows."""
+    count = len(sample)
+    places, turns = np.empty((count, 3)), np.empty((count, 3, 3))
+    carry(sample, x, R, binding, weights, offsets, places, turns)
+    error, pull = np.empty(3), np.eye(3)
+    for k in range(count):
+        s = sample[k]
+        square, along = 0.0, 0.0
+        for m in range(3):
+            arm = turns[k, m, 0] * offset[k, 0] + turns[k, m, 2] * offset[k, 2] + turns[k, m, 1] * offset[k, 1]
+            error[m] = places[k, m] - position[k, m] - arm
+            if len(ray):
+                along += error[m] * ray[k, m]
+        for m in range(3):
+            miss = error[m]
+            if len(ray):
+                miss -= (1 - DEPTH_FRACTION) * along * ray[k, m]
+                for n in range(3):
+                    pull[m, n] = (1.0 if m == n else 0.0) - (1 - DEPTH_FRACTION**2) * ray[k, m] * ray[k, n]
+            square += miss * miss
+        w = weight * precision[k] / (1 + square / scale_square) ** 2
+        for m in range(3):
+            pulled = pull[m, 0] * error[0] + pull[m, 2] * error[2] + pull[m, 1] * error[1]
+            b[s, m] += w * pulled
+            for n in range(3):
+                A[s, m, n] += w * pull[m, n]
 
 
 def find_homes(graph: NodeGraph, x: np.ndarray, R: np.ndarray, anchors: Anchors, frame: int) -> np.ndarray:

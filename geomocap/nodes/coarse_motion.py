@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from geomocap.nodes.extremities import match_ends
 from geomocap.nodes.node_graph import NodeGraph
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.nodes.surface_coverage import limbs_apart
+from geomocap.scheduling import map_here
 
 # Distance at which correspondences lose their weight (node spacings) and stiffness, step by step.
 _SETTLE = ((0.8, 2.0), (0.8, 1.0), (0.8, 1.0), (0.6, 1.0), (0.6, 1.0), (0.6, 1.0), (0.4, 1.0), (0.4, 1.0), (0.3, 1.0))
@@ -96,13 +98,11 @@ class CoarseModel:
     def next_state(self, frame: CoarseTarget, last: State, before: State | None) -> State:
         """Find the nodes in the next frame: from where they are expected and from where they were, near and far."""
         starts = [last] if before is None else [self.expected(last, before), last]
-        frame = self.sided(frame, starts[0])
-        found = []
-        for start in starts:
-            found.append(self.fit(frame, start, NEAR, False))
-            found.append(self.fit(frame, start, FAR, True))
+        unsided, frame = frame, self.sided(frame, starts[0])
+        tries = [(start, *how) for start in starts for how in ((NEAR, False), (FAR, True))]
+        found = map_here(lambda this: self.fit(frame, *this), tries)
         best = min(found, key=lambda s: self.cost(s, starts[0]))
-        turned = self.sided(frame, best)
+        turned = self.sided(unsided, best)
         if np.array_equal(turned.target.points.normals, frame.target.points.normals):
             return best
         return min(best, self.fit(turned, best, NEAR, False), key=lambda s: s.cost)
@@ -180,9 +180,8 @@ class CoarseModel:
 
     def _pull(self, target: Target, x: np.ndarray, R: np.ndarray, scale: float) -> Pull:
         y, normals = self.graph.deform(x, R)
-        tree = cKDTree(target.coordinates(scale))
         s = self.settings
-        return pull(target, tree, y, normals, self.graph.features, scale, s.point_weight, s.feature_weight)
+        return pull(target, y, normals, self.graph.features, scale, s.point_weight, s.feature_weight)
 
     def _step(
         self, x: np.ndarray, R: np.ndarray, A: np.ndarray, b: np.ndarray, stiffness: float
@@ -226,25 +225,57 @@ def follow(
     return states, homes
 
 
-def mend(model: CoarseModel, frames: list[CoarseTarget], states: list[State], reference: int, way: int) -> list[State]:
+def mend(
+    model: CoarseModel,
+    frames: list[CoarseTarget],
+    states: list[State],
+    reference: int,
+    ways: Sequence[int] = (-1, 1),
+) -> list[State]:
     """Try frames that don't fit between their neighbours in time again, starting between and from the neighbours.
 
     They fit badly, or a limb is far from where it would be halfway between its neighbours. A limb that was lost or
     taken for another where it moved fast is found again from the other side: a limb in the wrong place costs little of
-    the whole, but sooner or later it jumps, and from there on each frame is tried from the one after it.
+    the whole, but sooner or later it jumps, and from there on each frame is tried from the one after it. So it is gone
+    through the frames forwards (way 1) and backwards (way −1), one after the other.
     """
     states = list(states)
     T = len(states)
     if T < 3:
         return states
-    between = [model.between(states[t - 1], states[t + 1]) for t in range(1, T - 1)]
-    usual = float(np.median([model.cost(s, b) for s, b in zip(states[1:-1], between, strict=True)]))
-    for t in range(1, T - 1) if way > 0 else range(T - 2, 0, -1):
-        middle = model.between(states[t - 1], states[t + 1])
-        jumps = limbs_apart(states[t].x, middle.x, _AWAY * model.graph.spacing).any()
-        if t == reference or (model.cost(states[t], middle) < _BAD * usual and not jumps):
-            continue
-        frame = model.sided(frames[t], middle)
-        tried = [model.fit(frame, start, NEAR, False) for start in (middle, states[t + 1], states[t - 1])]
-        states[t] = min([states[t], *tried], key=lambda s: model.cost(s, middle))
+    fits = [_Fits(model) for _ in states]
+    for way in ways:
+        between = [model.between(states[t - 1], states[t + 1]) for t in range(1, T - 1)]
+        usual = float(np.median([model.cost(s, b) for s, b in zip(states[1:-1], between, strict=True)]))
+        for t in range(1, T - 1) if way > 0 else range(T - 2, 0, -1):
+            middle = model.between(states[t - 1], states[t + 1])
+            jumps = limbs_apart(states[t].x, middle.x, _AWAY * model.graph.spacing).any()
+            if t == reference or (model.cost(states[t], middle) < _BAD * usual and not jumps):
+                continue
+            tried = fits[t].of(model.sided(frames[t], middle), (middle, states[t + 1], states[t - 1]))
+            states[t] = min([states[t], *tried], key=lambda s: model.cost(s, middle))
     return states
+
+
+class _Fits:
+    """Fits to one frame, each of which is made once."""
+
+    def __init__(self, model: CoarseModel):
+        self.model = model
+        self.normals = np.zeros(0)
+        self.made: list[tuple[State, State]] = []
+
+    def of(self, frame: CoarseTarget, starts: Sequence[State]) -> list[State]:
+        """Fit the frame, with its normals turned in some way, from each of some states."""
+        if not np.array_equal(self.normals, frame.target.points.normals):
+            self.normals, self.made = frame.target.points.normals, []
+        new = [start for start in starts if self._known(start) is None]
+        found = map_here(lambda start: self.model.fit(frame, start, NEAR, False), new)
+        self.made += zip(new, found, strict=True)
+        return [fit for start in starts if (fit := self._known(start)) is not None]
+
+    def _known(self, start: State) -> State | None:
+        for begun, fit in self.made:
+            if np.array_equal(begun.x, start.x) and np.array_equal(begun.R, start.R):
+                return fit
+        return None

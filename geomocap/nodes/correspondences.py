@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -62,12 +63,26 @@ class Target:
         self, positions: np.ndarray, normals: np.ndarray, features: np.ndarray, scale: float
     ) -> np.ndarray:
         """Positions (M, 3), normals and features (M, F) side by side, each scaled to metres."""
-        return np.hstack([positions, scale * self.normal_weight * normals, scale / self.feature_scale * features])
+        found = np.empty((len(positions), 6 + features.shape[1]))
+        found[:, :3] = positions
+        np.multiply(scale * self.normal_weight, normals, out=found[:, 3:6])
+        np.multiply(scale / self.feature_scale, features, out=found[:, 6:])
+        return found
+
+    def tree(self, scale: float) -> cKDTree:
+        """Tree of the coordinates at a scale, which is kept."""
+        tree = self._trees.get(scale)
+        if tree is None:
+            tree = self._trees[scale] = cKDTree(self.coordinates(scale))
+        return tree
+
+    @cached_property
+    def _trees(self) -> dict[float, cKDTree]:
+        return {}
 
 
 def pull(
     target: Target,
-    tree: cKDTree,
     y: np.ndarray,
     normals: np.ndarray,
     features: np.ndarray,
@@ -80,8 +95,6 @@ def pull(
     Parameters
     ----------
     target : Target
-    tree : cKDTree
-        Of the target's coordinates at this scale.
     y, normals, features : (S, 3), (S, 3), (S, F) float
         The surface as it stands.
     scale : float
@@ -91,34 +104,38 @@ def pull(
     feature_weight : float
         Weight of the features' differences, one feature scale for one `scale` of distance.
     """
-    points = target.points
+    points, tree = target.points, target.tree(scale)
     own = target.search_coordinates(y, normals, features, scale)
     far_out, found = tree.query(own)
-    back, taker = cKDTree(own).query(target.coordinates(scale))
+    back, taker = cKDTree(own).query(tree.data)
     forth_weight = np.exp(-0.5 * (far_out / scale) ** 2)
     back_weight = np.exp(-0.5 * (back / scale) ** 2)
     fraction = min(len(y) / len(points), 1.0)
-    A, b = gather_pulls(
+    A, b, across = gather_pulls(
         y, points.positions, points.normals, found, forth_weight, taker, fraction * back_weight, point_weight
     )
     if features.shape[1] and feature_weight > 0:
-        per_feature = (scale / target.feature_scale)[:, None]
-        n = points.normals[found]
-        error = y - points.positions[found]
-        along = error - (error * n).sum(axis=1)[:, None] * n
-        G = points.gradients[found] * per_feature
-        r = (points.features[found] - features) * per_feature[:, 0] + np.einsum("sfi,si->sf", G, along)
-        strength = feature_weight * forth_weight
-        A += strength[:, None, None] * np.einsum("sfi,sfj->sij", G, G)
-        b += strength[:, None] * np.einsum("sfi,sf->si", G, r)
+        per_feature = scale / target.feature_scale
+        gather_features(
+            A,
+            b,
+            y,
+            features,
+            points.positions,
+            points.normals,
+            points.features,
+            points.gradients,
+            found,
+            feature_weight * forth_weight,
+            per_feature,
+        )
     energy = 1 - 0.5 * float(forth_weight.mean() + back_weight.mean())
-    across = ((y - points.positions[found]) * points.normals[found]).sum(axis=1)
     return Pull(A, b, forth_weight, across, energy)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def gather_pulls(y, q, n, found, forth_weight, taker, back_weight, point_weight):
-    """Sum up what points pull at samples: A (S, 3, 3) and b (S, 3).
+    """Sum up what points pull at samples, A (S, 3, 3) and b (S, 3); their distances across their points' planes, (S,).
 
     Parameters
     ----------
@@ -135,6 +152,7 @@ def gather_pulls(y, q, n, found, forth_weight, taker, back_weight, point_weight)
     """
     A = np.zeros((len(y), 3, 3))
     b = np.zeros((len(y), 3))
+    distance = np.empty(len(y))
     for k in range(len(found) + len(taker)):
         if k < len(found):
             s, p, w = k, found[k], forth_weight[k]
@@ -143,10 +161,53 @@ def gather_pulls(y, q, n, found, forth_weight, taker, back_weight, point_weight)
             s, w = taker[p], back_weight[p]
         e0, e1, e2 = y[s, 0] - q[p, 0], y[s, 1] - q[p, 1], y[s, 2] - q[p, 2]
         across = e0 * n[p, 0] + e1 * n[p, 1] + e2 * n[p, 2]
+        if k < len(found):
+            distance[s] = across
         e = (e0, e1, e2)
         for i in range(3):
             b[s, i] += w * (n[p, i] * across + point_weight * e[i])
             A[s, i, i] += w * point_weight
             for j in range(3):
                 A[s, i, j] += w * n[p, i] * n[p, j]
-    return A, b
+    return A, b, distance
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def gather_features(A, b, y, own, q, n, features, gradients, found, strength, per_feature):
+    """Add what the features of points ask of samples to A (S, 3, 3) and b (S, 3).
+
+    Parameters
+    ----------
+    y, own : (S, 3), (S, F) float
+        Samples and their features.
+    q, n : (M, 3) float
+        Points and their normals.
+    features, gradients : (M, F), (M, F, 3) float
+        The points' features, and how these change along the surface.
+    found : (S,) int
+        Each sample's point, and its weight `strength` (S,).
+    per_feature : (F,) float
+        Distance that counts as much as a feature's change by one.
+    """
+    squares, products = np.empty((3, 3)), np.empty(3)
+    # three colours are summed up as `np.einsum` does: the first and the third, then the second
+    F = len(per_feature)
+    order = np.concatenate((np.arange(0, F, 2), np.arange(1, F, 2)))
+    for s in range(len(y)):
+        p, w = found[s], strength[s]
+        e0, e1, e2 = y[s, 0] - q[p, 0], y[s, 1] - q[p, 1], y[s, 2] - q[p, 2]
+        across = e0 * n[p, 0] + e1 * n[p, 1] + e2 * n[p, 2]
+        e0, e1, e2 = e0 - across * n[p, 0], e1 - across * n[p, 1], e2 - across * n[p, 2]
+        squares[:], products[:] = 0.0, 0.0
+        for f in order:
+            unit = per_feature[f]
+            g = (gradients[p, f, 0] * unit, gradients[p, f, 1] * unit, gradients[p, f, 2] * unit)
+            r = (features[p, f] - own[s, f]) * unit + (g[0] * e0 + g[1] * e1 + g[2] * e2)
+            for i in range(3):
+                products[i] += g[i] * r
+                for j in range(3):
+                    squares[i, j] += g[i] * g[j]
+        for i in range(3):
+            b[s, i] += w * products[i]
+            for j in range(3):
+                A[s, i, j] += w * squares[i, j]

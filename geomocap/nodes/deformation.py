@@ -11,13 +11,17 @@ Sources: O. Sorkine, M. Alexa, "As-rigid-as-possible surface modeling", SGP 2007
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.spatial.transform import Rotation
 
+from geomocap.model.fused import fma
 from geomocap.nodes.node_graph import NodeGraph
+
+_MOST = 0.5  # radians by which a node turns in one step: the linearisation ends there
+_SMALL = 1e-3  # radians up to which a sine is its series
 
 
 @dataclass(frozen=True)
@@ -144,35 +148,42 @@ def normal_equations(
             g[j, 3] += w * r0
             g[j, 4] += w * r1
             g[j, 5] += w * r2
-    J = np.zeros((K, 3, 6))
-    AJ = np.zeros((K, 3, 6))
+    arms, AJ = np.zeros((K, 4)), np.zeros((K, 3, 6))
     for s in range(S):
         if A[s, 0, 0] + A[s, 1, 1] + A[s, 2, 2] == 0:
             continue
         for k in range(K):
             i = binding[s, k]
             w = weights[s, k]
-            o = offsets[s, k]
-            a0 = w * (R[i, 0, 0] * o[0] + R[i, 0, 1] * o[1] + R[i, 0, 2] * o[2])
-            a1 = w * (R[i, 1, 0] * o[0] + R[i, 1, 1] * o[1] + R[i, 1, 2] * o[2])
-            a2 = w * (R[i, 2, 0] * o[0] + R[i, 2, 1] * o[1] + R[i, 2, 2] * o[2])
+            o0, o1, o2 = offsets[s, k, 0], offsets[s, k, 1], offsets[s, k, 2]
+            a0 = w * (R[i, 0, 0] * o0 + R[i, 0, 1] * o1 + R[i, 0, 2] * o2)
+            a1 = w * (R[i, 1, 0] * o0 + R[i, 1, 1] * o1 + R[i, 1, 2] * o2)
+            a2 = w * (R[i, 2, 0] * o0 + R[i, 2, 1] * o1 + R[i, 2, 2] * o2)
+            arms[k, 0], arms[k, 1], arms[k, 2], arms[k, 3] = a0, a1, a2, w
             # dy/dturn = −[a]ₓ, dy/dshift = w
-            J[k, 0, 1], J[k, 0, 2] = a2, -a1
-            J[k, 1, 0], J[k, 1, 2] = -a2, a0
-            J[k, 2, 0], J[k, 2, 1] = a1, -a0
-            J[k, 0, 3] = J[k, 1, 4] = J[k, 2, 5] = w
             for m in range(3):
-                for n in range(6):
-                    AJ[k, m, n] = A[s, m, 0] * J[k, 0, n] + A[s, m, 1] * J[k, 1, n] + A[s, m, 2] * J[k, 2, n]
+                A0, A1, A2 = A[s, m, 0], A[s, m, 1], A[s, m, 2]
+                AJ[k, m, 0], AJ[k, m, 1], AJ[k, m, 2] = A2 * a1 - A1 * a2, A0 * a2 - A2 * a0, A1 * a0 - A0 * a1
+                AJ[k, m, 3], AJ[k, m, 4], AJ[k, m, 5] = A0 * w, A1 * w, A2 * w
+            b0, b1, b2 = b[s, 0], b[s, 1], b[s, 2]
+            g[i, 0] -= a1 * b2 - a2 * b1
+            g[i, 1] -= a2 * b0 - a0 * b2
+            g[i, 2] -= a0 * b1 - a1 * b0
+            g[i, 3] -= w * b0
+            g[i, 4] -= w * b1
+            g[i, 5] -= w * b2
         for k in range(K):
-            i = binding[s, k]
-            for m in range(6):
-                g[i, m] -= J[k, 0, m] * b[s, 0] + J[k, 1, m] * b[s, 1] + J[k, 2, m] * b[s, 2]
+            a0, a1, a2, w = arms[k, 0], arms[k, 1], arms[k, 2], arms[k, 3]
             for h in range(K):
-                block = of_samples[s, k, h]
-                for m in range(6):
-                    for n in range(6):
-                        H[block, m, n] += J[k, 0, m] * AJ[h, 0, n] + J[k, 1, m] * AJ[h, 1, n] + J[k, 2, m] * AJ[h, 2, n]
+                B = H[of_samples[s, k, h]]
+                for n in range(6):
+                    B0, B1, B2 = AJ[h, 0, n], AJ[h, 1, n], AJ[h, 2, n]
+                    B[0, n] += a1 * B2 - a2 * B1
+                    B[1, n] += a2 * B0 - a0 * B2
+                    B[2, n] += a0 * B1 - a1 * B0
+                    B[3, n] += w * B0
+                    B[4, n] += w * B1
+                    B[5, n] += w * B2
     return H, g
 
 
@@ -282,7 +293,30 @@ def step(
     for m in range(6):
         H[pattern.diagonal, m, m] += 1e-4 * (size if m < 3 else 1.0)
     z = solve_blocks(H, g, pattern.start, pattern.column, pattern.diagonal, iterations, 1e-3)
-    turn = z[:, :3]
-    # no node turns by more than half a radian in one step: the linearisation ends there
-    much = np.maximum(np.linalg.norm(turn, axis=1, keepdims=True) / 0.5, 1.0)
-    return x + z[:, 3:], Rotation.from_rotvec(turn / much).as_matrix() @ R
+    turned = np.empty(R.shape)
+    turn_by(z[:, :3], R, _MOST, turned)
+    return x + z[:, 3:], turned
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def turn_by(turns, R, most, turned):
+    """Fill rotations (N, 3, 3), those of R turned by rotation vectors (N, 3), which are shortened to `most` radians."""
+    T = np.empty((3, 3))
+    for i in range(len(turns)):
+        x, y, z = turns[i, 0], turns[i, 1], turns[i, 2]
+        much = max(math.sqrt(x * x + y * y + z * z) / most, 1.0)
+        x, y, z = x / much, y / much, z / much
+        square = x * x + y * y + z * z
+        angle = math.sqrt(square)
+        # sine of half the angle over the angle, and a quaternion
+        if angle <= _SMALL:
+            part = 0.5 - square / 48 + square * square / 3840
+        else:
+            part = math.sin(angle / 2) / angle
+        x, y, z, w = part * x, part * y, part * z, math.cos(angle / 2)
+        T[0, 0], T[0, 1], T[0, 2] = x * x - y * y - z * z + w * w, 2 * (x * y - z * w), 2 * (x * z + y * w)
+        T[1, 0], T[1, 1], T[1, 2] = 2 * (x * y + z * w), -x * x + y * y - z * z + w * w, 2 * (y * z - x * w)
+        T[2, 0], T[2, 1], T[2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), -x * x - y * y + z * z + w * w
+        for m in range(3):
+            for n in range(3):
+                turned[i, m, n] = fma(T[m, 2], R[i, 2, n], fma(T[m, 1], R[i, 1, n], T[m, 0] * R[i, 0, n]))

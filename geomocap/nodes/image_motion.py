@@ -181,13 +181,14 @@ class ImageMotion:
 
         Images are compared where both states have them.
         """
+        frame = replace(frame)  # what is kept with it goes with it
         both = np.logical_and.reduce([np.isfinite(e) for _, e in found])
         usual = max(float(np.median([e[both] for _, e in found])), _LEAST) if both.any() else 1.0
         costs = []
         for (x, R), errors in found:
             y, normals = self.graph.deform(x, R)
             c = self._scale()
-            points = pull(frame, cKDTree(frame.coordinates(c)), y, normals, self.graph.features, c, 0.0, 0.0)
+            points = pull(frame, y, normals, self.graph.features, c, 0.0, 0.0)
             strain = float(np.minimum((self.graph.strain(x, R) / self.give) ** 2, 1.0).mean())
             unlike = float((errors[both] / (errors[both] + usual)).mean()) if both.any() else 0.0
             costs.append(points.energy + self.strain_cost * strain + unlike)
@@ -223,12 +224,11 @@ class ImageMotion:
         x, R = start
         g, c = self.graph, self._scale()
         frame = replace(frame, points=frame.points.turned_like(*g.deform(x, R), 0.5 * g.spacing))
-        tree = cKDTree(frame.coordinates(c))
         fraction = len(g.samples) / len(g.nodes) / 4
         errors = np.zeros((0,))
         for _ in range(_STEPS[level]):
             y, normals = g.deform(x, R)
-            found = pull(frame, tree, y, normals, g.features, c, self.point_weight, 0.0)
+            found = pull(frame, y, normals, g.features, c, self.point_weight, 0.0)
             A, b = _CORRELATED * found.A, _CORRELATED * found.b
             noise = max(_NORMAL * float(np.median(np.abs(found.across))), 0.3 * self.point_spacing)
             errors = self._add_images(A, b, noise, images, earlier, y, normals, self._axes(R), level)

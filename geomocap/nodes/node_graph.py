@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from geomocap.errors import GeometryError
+from geomocap.model.fused import turned
 from geomocap.nodes.surface_points import PointSet
 
 _LEAST_LENGTH = 1e-12  # of a blend of normals
@@ -68,12 +69,9 @@ class NodeGraph:
 
     def strain(self, x: np.ndarray, R: np.ndarray) -> np.ndarray:
         """How far each edge is from moving rigidly with its two nodes, (E,), as a fraction of its length."""
-        i, j = self.edges.T
-        rest = (self.nodes[i] - self.nodes[j])[..., None]
-        edge = x[i] - x[j]
-        of_i = edge - np.matmul(R[i], rest)[..., 0]
-        of_j = edge - np.matmul(R[j], rest)[..., 0]
-        return np.sqrt(((of_i**2).sum(axis=1) + (of_j**2).sum(axis=1)) / 2) / self.lengths
+        found = np.empty(len(self.edges))
+        strains(x, R, self.nodes, self.edges, self.lengths, found)
+        return found
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -98,6 +96,20 @@ def deform(x, R, binding, weights, offsets, normals, places, turned):
         length = max(math.sqrt(square), _LEAST_LENGTH)
         for m in range(3):
             turned[s, m] /= length
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def strains(x, R, nodes, edges, lengths, found):
+    """Fill the strain (E,) of edges, see `NodeGraph.strain`."""
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        d0, d1, d2 = nodes[i, 0] - nodes[j, 0], nodes[i, 1] - nodes[j, 1], nodes[i, 2] - nodes[j, 2]
+        of_i, of_j = 0.0, 0.0
+        for m in range(3):
+            edge = x[i, m] - x[j, m]
+            of_i += (edge - turned(R[i], m, d0, d1, d2)) ** 2
+            of_j += (edge - turned(R[j], m, d0, d1, d2)) ** 2
+        found[e] = math.sqrt((of_i + of_j) / 2) / lengths[e]
 
 
 def farthest_points(positions: np.ndarray, count: int) -> np.ndarray:

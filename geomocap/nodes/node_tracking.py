@@ -161,8 +161,7 @@ class NodeModel:
         for scale, stiffness in FINE:
             c = max(scale * h, 1.5 * self.spacing)
             y, normals = g.deform(x, R)
-            tree = cKDTree(target.coordinates(c))
-            found = pull(target, tree, y, normals, g.features, c, s.point_weight, s.feature_weight)
+            found = pull(target, y, normals, g.features, c, s.point_weight, s.feature_weight)
             marks.add_to(found.A, found.b, g, x, R, s.anchor_weight, c)
             soft = 1 / (1 + (g.strain(x, R) / s.give) ** 2) ** 2
             fraction = len(g.samples) / len(g.nodes) / 4
@@ -180,8 +179,7 @@ class NodeModel:
         g, s, h = self.graph, self.settings, self.graph.spacing
         c = max(FINE[-1][0] * h, 1.5 * self.spacing)
         y, normals = g.deform(x, R)
-        tree = cKDTree(target.coordinates(c))
-        found = pull(target, tree, y, normals, g.features, c, s.point_weight, 0.0)
+        found = pull(replace(target), y, normals, g.features, c, s.point_weight, 0.0)
         covariance, support = node_covariance(
             self.patches, normals, found.support, found.across, s.slide * h, s.noise * h, anchored
         )
@@ -274,8 +272,7 @@ def track_nodes(
     states = back[:0:-1] + ahead
     homes = [homes_back if frame < reference else homes_ahead for frame in range(n_frames)]
     marked = [model.coarse.marked(coarse[k], homes[k], known, k) for k in range(n_frames)]
-    for way in (-1, 1):
-        states = mend(model.coarse, marked, states, reference, way)
+    states = mend(model.coarse, marked, states, reference)
 
     def refine(frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         target = Target(frames[frame], scales, settings.normal_weight)

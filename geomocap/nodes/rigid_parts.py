@@ -238,8 +238,7 @@ class PartTracker:
         for scale in scales:
             c = max(scale * g.spacing, self.closest)
             y, turned = carry_samples(R, t, label, samples, normals, binding, weights)
-            tree = cKDTree(target.coordinates(c))
-            found = pull(target, tree, y, turned, features, c, _ALONG, s.feature_weight)
+            found = pull(target, y, turned, features, c, _ALONG, s.feature_weight)
             x = (R[label] @ g.nodes[..., None])[..., 0] + t[label]
             hold = firm / (1 + (g.strain(x, R[label])[apart] / s.give) ** 2) ** 2
             middle = _means(x, label, len(R))

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
-from geomocap.model.motion_paths import MotionPaths
-from geomocap.nodes.anchors import AnchorPoints, Anchors, find_homes
+from geomocap.model.motion_paths import DEPTH_FRACTION, MotionPaths, sure_part
+from geomocap.nodes.anchors import AnchorPoints, Anchors, carried, find_homes
 from geomocap.nodes.node_tracking import track_nodes
 from tests.geomocap.test_nodes_tracking import SMALL, capsule, small_graph
 
@@ -48,6 +49,34 @@ def test_wrong_depths_of_anchors_do_little_harm_where_rays_say_so():
     misled, told = error(MotionPaths(marks + off))[0], error(MotionPaths(marks + off, ray=ray))[0]
     assert misled > 0.01
     assert told < 0.005
+
+
+@pytest.mark.parametrize("rays", [False, True])
+def test_what_marks_pull_is_the_sum_written_out(rays):
+    _, _, g = small_graph()
+    rng = np.random.default_rng(6)
+    x, R = g.nodes + 0.1 * rng.normal(size=g.nodes.shape), Rotation.random(len(g.nodes), rng=rng).as_matrix()
+    K, S = 40, len(g.samples)
+    sample, offset, precision = rng.integers(0, S, K), 0.01 * rng.normal(size=(K, 3)), rng.random(K)
+    position = g.deform(x, R)[0][sample] + 0.1 * rng.normal(size=(K, 3))
+    ray = rng.normal(size=(K, 3))
+    ray *= (rng.random((K, 1)) < 0.5) / np.linalg.norm(ray, axis=1, keepdims=True)
+    A, b = np.ones((S, 3, 3)), np.ones((S, 3))
+    marks = AnchorPoints(sample, offset, position, precision, ray if rays else None)
+    marks.add_to(A, b, g, x, R, 4.0, 0.1)
+    y, turn = carried(g, sample, x, R)
+    np.testing.assert_allclose(y, g.deform(x, R)[0][sample], atol=1e-12)
+    np.testing.assert_allclose(turn, np.einsum("kh,khij->kij", g.weights[sample], R[g.binding[sample]]), atol=1e-12)
+    A2, b2 = np.ones((S, 3, 3)), np.ones((S, 3))
+    for k, s in enumerate(sample):
+        error = y[k] - position[k] - turn[k] @ offset[k]
+        miss = sure_part(error, ray[k] if rays else None)
+        w = 4 * precision[k] / (1 + miss @ miss / 0.1**2) ** 2
+        W = w * (np.eye(3) - (1 - DEPTH_FRACTION**2) * rays * np.outer(ray[k], ray[k]))
+        A2[s] += W
+        b2[s] += W @ error
+    np.testing.assert_allclose(A, A2, atol=1e-12)
+    np.testing.assert_allclose(b, b2, atol=1e-12)
 
 
 def test_anchors_pull_across_their_rays_and_hardly_along_them():
