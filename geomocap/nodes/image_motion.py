@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -204,12 +205,17 @@ class ImageMotion:
     def _axes(self, R: np.ndarray) -> np.ndarray:
         """Two axes of the tangent plane of each sample, turned as its nodes are: (S, 2, 3)."""
         g = self.graph
-        n = g.normals
+        turn = (g.weights[..., None, None] * R[g.binding]).sum(axis=1)
+        return np.ascontiguousarray(np.einsum("sij,skj->ski", turn, self._axes_at_rest))
+
+    @cached_property
+    def _axes_at_rest(self) -> np.ndarray:
+        """Two axes of the tangent plane of each sample in the reference frame, (S, 2, 3)."""
+        n = self.graph.normals
         other = np.where(np.abs(n[:, :1]) < 0.7, np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]]))
         first = np.cross(n, other)
         first /= np.linalg.norm(first, axis=1, keepdims=True)
-        turn = (g.weights[..., None, None] * R[g.binding]).sum(axis=1)
-        return np.ascontiguousarray(np.einsum("sij,skj->ski", turn, np.stack([first, np.cross(n, first)], axis=1)))
+        return np.stack([first, np.cross(n, first)], axis=1)
 
     def _fit(
         self,
