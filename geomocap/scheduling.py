@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cache
 from itertools import pairwise
 from typing import TypeVar
 
@@ -73,10 +74,15 @@ def spread(kernel: Callable[..., object], count: int, *arguments: object, few: i
         kernel(0, count, *arguments)
         return
     borders = [count * k // (_PARTS * workers) for k in range(_PARTS * workers + 1)]
-    with ThreadPoolExecutor(workers) as pool:
-        parts = [pool.submit(kernel, a, b, *arguments) for a, b in pairwise(borders) if b > a]
-        for part in parts:
-            part.result()
+    pool = _pool(os.getpid(), workers)
+    for part in [pool.submit(kernel, a, b, *arguments) for a, b in pairwise(borders) if b > a]:
+        part.result()
+
+
+@cache
+def _pool(process: int, workers: int) -> ThreadPoolExecutor:
+    """Threads that stay for all kernels of a process: they never wait for each other. A forked one has none of them."""
+    return ThreadPoolExecutor(workers, f"kernels-{process}")
 
 
 def map_here(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:

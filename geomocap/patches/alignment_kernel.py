@@ -67,8 +67,8 @@ def align_patches(
         Patches to align.
     X, Q : (N, 3), (N, 3, 3) float
         Places at the start; replaced by those found.
-    patches : shape (N, M, 5), size (N,), rows (N,) int, templates (R, C, L, M, 3), usable (R, C, M), doubt (N, C)
-        Arrays of `Patches` and of their store. The size is the unit in which steps are limited.
+    patches : shape (N, M, 5), size, rows (N,), templates (R, C, L, M, 3), usable (R, C, M), doubt (N, C)
+        Arrays of `Patches` and of their store, which may have one camera for all. Steps are limited in units of size.
     use : (N, C) uint8
         Cameras to align with.
     views : images (C, H, W) float32, masks (C, H, W) uint8, projections (C, 3, 4), centers (C, 3)
@@ -126,7 +126,8 @@ def align_patches(
                 local[r] = 0.0
                 for k in range(3):
                     local[r] += q_n[k, r] * (centers[c, k] - x_n[k])
-            seen_by = templates[rows[n], c, level], usable[rows[n], c], masks[c], use_mask
+            own = min(c, templates.shape[1] - 1)  # all cameras may share one template
+            seen_by = templates[rows[n], own, level], usable[rows[n], own], masks[c], use_mask
             filled = places[c], J[c], T[c], moments
             counts[c] = choose_samples(A[c], local, shape[n], *seen_by, iterations > 0, stride, *filled)
             if counts[c] == 0:

@@ -10,13 +10,16 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
+from numba import njit
 
 from geomocap.patches.patch_prediction import nearest
+from geomocap.scheduling import spread
 
 _COUNT = 12  # companions of a patch
 _ENOUGH = 3  # companions whose places must be known
 _RINGS = 8  # of lost patches, each one placed by those before
 _ROUNDS = 5  # in which patches that too few companions bear out are left out
+_FEW = 200  # patches that are not worth waking other threads for
 _AHEAD = 1.5  # frames; what another motion would do in them counts as distance
 
 
@@ -119,10 +122,9 @@ class Companions:
                 break
             near = rows[todo]
             spot = X[near] + np.einsum("akij,akj->aki", Q[near], self.places[todo])
-            away = np.linalg.norm(spot[:, :, None] - spot[:, None], axis=3)
-            away = np.where(have[:, None] & have[:, :, None], away, 0.0).sum(axis=2)
-            typical = np.where(have, away, np.inf).argmin(axis=1)
-            one = np.arange(len(todo))
+            away = np.zeros((*have.shape, have.shape[1]))
+            spread(_distances, len(todo), spot, have, away, few=_FEW)
+            one, typical = np.arange(len(todo)), np.where(have, away.sum(axis=2), np.inf).argmin(axis=1)
             X[todo] = spot[one, typical]
             Q[todo] = Q[near[one, typical]] @ self.turns[todo, typical]
             known[todo] = True
@@ -166,3 +168,17 @@ class Companions:
         order = np.argsort(identity)
         rows = order[np.searchsorted(identity, self.identity, sorter=order).clip(0, len(identity) - 1)]
         return rows, identity[rows] == self.identity
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _distances(begin, end, spots, have, away):
+    """Fill `away` (A, K, K) with the distances of spots (A, K, 3) from each other, of those that `have` (A, K)."""
+    K = have.shape[1]
+    for a in range(begin, end):
+        for i in range(K):
+            for j in range(K):
+                if have[a, i] and have[a, j]:
+                    square = 0.0
+                    for k in range(3):
+                        square += (spots[a, i, k] - spots[a, j, k]) ** 2
+                    away[a, i, j] = np.sqrt(square)

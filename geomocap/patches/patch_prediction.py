@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
+from numba import get_num_threads, njit
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from geomocap.patches.frame_views import FrameViews
+from geomocap.scheduling import map_here
 
 _FLOW_WINDOW = (13, 13)  # pixels
 _FLOW_LEVELS = 3  # of the pyramid
@@ -37,11 +38,12 @@ def image_flow(previous: FrameViews, view: FrameViews, positions: np.ndarray, se
     """
     pixel, _ = previous.project(positions)
     flow = np.full(pixel.shape, np.nan)
-    for c in range(view.count):
+
+    def follow(c: int) -> None:
         rows = np.flatnonzero(seen[:, c] & np.isfinite(pixel[:, c]).all(axis=1))
         both = (previous.masks[c] | view.masks[c]) != 0
         if not len(rows) or not both.any():
-            continue
+            return
         box = _box(both, 24)
         before, after = (_bytes(v.levels[-1, c][box]) for v in (previous, view))
         corner = np.array([box[1].start, box[0].start], float)
@@ -51,6 +53,8 @@ def image_flow(previous: FrameViews, view: FrameViews, positions: np.ndarray, se
         )
         moved = (found - start)[:, 0].astype(float)
         flow[rows, c] = np.where(status == 1, moved, np.nan)
+
+    map_here(follow, range(view.count))
     return flow
 
 
@@ -63,7 +67,7 @@ def lift_flow(view: FrameViews, positions: np.ndarray, flow: np.ndarray, neighbo
     enough = np.flatnonzero(known.sum(axis=1) >= 2)
     if len(enough) < neighbours:
         return shift
-    near = cKDTree(positions[enough]).query(positions, neighbours)[1]
+    near = cKDTree(positions[enough]).query(positions, neighbours, workers=get_num_threads())[1]
     return np.median(shift[enough[near]], axis=1)
 
 
@@ -134,7 +138,7 @@ def carried(
     which: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Move patches `which` (A,) by the rigid motions of patches `source` (A, K): positions (A, K, 3), frames."""
-    turn = new_frames[source] @ np.swapaxes(frames[source], -1, -2)
+    turn = (new_frames @ np.swapaxes(frames, -1, -2))[source]
     arm = positions[which][:, None] - positions[source]
     return new_positions[source] + np.einsum("akij,akj->aki", turn, arm), turn @ frames[which][:, None]
 
@@ -144,7 +148,7 @@ def nearest(positions: np.ndarray, of: np.ndarray, among: np.ndarray, count: int
     count = min(count, len(among) - 1)
     if count < 1:
         return np.zeros((len(of), 0), int)
-    found = among[cKDTree(positions[among]).query(positions[of], count + 1)[1]]
+    found = among[cKDTree(positions[among]).query(positions[of], count + 1, workers=get_num_threads())[1]]
     # put the patch itself last, then cut it off
     order = np.argsort(found == of[:, None], axis=1, kind="stable")
     return np.take_along_axis(found, order, axis=1)[:, :count]

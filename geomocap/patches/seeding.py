@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from scipy.spatial import cKDTree
 
 from geomocap.patches.frame_views import FrameViews
@@ -60,14 +61,37 @@ def spread(points: np.ndarray, spacing: float, taken: np.ndarray, rng: np.random
     order = rng.permutation(np.flatnonzero(free))
     if not len(order):
         return order
-    tree = cKDTree(points[order])
-    dead = np.zeros(len(order), bool)
-    keep = []
-    for i, point in enumerate(points[order]):
-        if not dead[i]:
-            keep.append(order[i])
-            dead[tree.query_ball_point(point, spacing)] = True
-    return np.sort(np.array(keep))
+    kept = np.zeros(len(order), np.bool_)
+    _keep_apart(points[order], spacing, kept)
+    return np.sort(order[kept])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _keep_apart(points, spacing, kept):
+    """Fill `kept` (N,) bool: points (N, 3) from which those kept before are farther than `spacing`.
+
+    Cells as wide as that hold those kept, each as a chain.
+    """
+    low, size = np.empty(3), np.empty(3, np.int64)
+    for i in range(3):
+        low[i] = points[:, i].min()
+        size[i] = int((points[:, i].max() - low[i]) / spacing) + 3  # a border of empty cells
+    last = np.full((size[0], size[1], size[2]), -1, np.int64)
+    before = np.empty(len(points), np.int64)
+    for n in range(len(points)):
+        x, y, z = points[n]
+        a, b, c = int((x - low[0]) / spacing) + 1, int((y - low[1]) / spacing) + 1, int((z - low[2]) / spacing) + 1
+        free = True
+        for cell in range(27):
+            other = last[a + cell // 9 - 1, b + cell // 3 % 3 - 1, c + cell % 3 - 1]
+            while free and other >= 0:
+                dx, dy, dz = points[other, 0] - x, points[other, 1] - y, points[other, 2] - z
+                free = dx * dx + dy * dy + dz * dz > spacing * spacing
+                other = before[other]
+        kept[n] = free
+        if free:
+            before[n] = last[a, b, c]
+            last[a, b, c] = n
 
 
 def surface_frames(view: FrameViews, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

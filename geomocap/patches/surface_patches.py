@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from numba import njit
 
 from geomocap.patches.alignment_kernel import align_patches
 from geomocap.patches.frame_views import FrameViews
@@ -146,10 +147,11 @@ class Patches:
         return replace(self, **{name: getattr(self, name)[which] for name in _OWN})
 
     def join(self, other: Patches) -> Patches:
-        """Return these followed by others, without the templates of any that were left out."""
+        """Return these followed by others; these share their store with the new ones from then on."""
         parts = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _OWN}
-        parts["rows"] = np.arange(len(self) + len(other))
-        return Patches(**parts, store=self.store.join(self.rows, other.store, other.rows))
+        store, mine, others = self.store.join(self.rows, other.store, other.rows)
+        parts["rows"] = np.concatenate([mine, others])
+        return Patches(**parts, store=store)
 
     def moved(self, positions: np.ndarray, frames: np.ndarray) -> Patches:
         """Return them at other places."""
@@ -179,10 +181,43 @@ def visible(
     facing : float
         Least cosine between normal and direction to the camera.
     """
-    depth, surface = view.depths(positions)
-    return (facings(positions, frames[:, :, 2], view) > facing) & (
-        depth - surface - np.nan_to_num(np.maximum(hidden, 0.0)) < slack
+    seen = np.empty(hidden.shape, np.bool_)
+    spread(
+        _see,
+        len(seen),
+        np.ascontiguousarray(positions, np.float64),
+        np.ascontiguousarray(frames[:, :, 2], np.float64),
+        (view.projections, view.centers, view.depth),
+        hidden,
+        np.broadcast_to(slack, (len(seen), 1)).copy(),
+        facing,
+        seen,
+        few=_FEW,
     )
+    return seen
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _see(begin, end, positions, normals, views, hidden, slack, facing, seen):
+    """Fill `seen` (N, C), see `visible`; views: projections (C, 3, 4), centers (C, 3), depth of surfaces (C, H, W)."""
+    P, centers, surface = views
+    C, H, W = surface.shape
+    for n in range(begin, end):
+        x, y, z = positions[n]
+        for c in range(C):
+            seen[n, c] = False
+            a, b, d = centers[c, 0] - x, centers[c, 1] - y, centers[c, 2] - z
+            cosine = a * normals[n, 0] + b * normals[n, 1] + d * normals[n, 2]
+            if not cosine / np.sqrt(a * a + b * b + d * d) > facing:
+                continue
+            w = P[c, 2, 0] * x + P[c, 2, 1] * y + P[c, 2, 2] * z + P[c, 2, 3]
+            u = (P[c, 0, 0] * x + P[c, 0, 1] * y + P[c, 0, 2] * z + P[c, 0, 3]) / w
+            v = (P[c, 1, 0] * x + P[c, 1, 1] * y + P[c, 1, 2] * z + P[c, 1, 3]) / w
+            if w > 0 and u >= -0.5 and v >= -0.5 and u <= W and v <= H:
+                column, row = int(np.rint(u)), int(np.rint(v))
+                if column < W and row < H and np.isfinite(surface[c, row, column]):
+                    behind = hidden[n, c] if hidden[n, c] > 0 else 0.0
+                    seen[n, c] = w - surface[c, row, column] - behind < slack[n, 0]
 
 
 def facings(positions: np.ndarray, normals: np.ndarray, view: FrameViews) -> np.ndarray:
@@ -228,9 +263,8 @@ def one_template(patches: Patches, view: FrameViews) -> tuple[Patches, np.ndarra
 
 def as_one_camera(patches: Patches, camera: np.ndarray, has: np.ndarray) -> Patches:
     """Let the cameras `has` (N, C) look for what one camera, (N,) int, has seen of each patch."""
-    return replace(
-        patches, rows=np.arange(len(patches)), store=patches.store.of_one_camera(patches.rows, camera), has=has
-    )
+    store, rows = patches.store.of_one_camera(patches.rows, camera)
+    return replace(patches, rows=rows, store=store, has=has)
 
 
 def doubted(patches: Patches, found: PatchAlignment) -> PatchAlignment:

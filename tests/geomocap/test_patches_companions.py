@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from geomocap.model.rotations import nearest_rotation
-from geomocap.patches.companions import Companions
+from geomocap.patches.companions import Companions, _distances
 from geomocap.patches.patch_prediction import carried, orthonormal
 
 RNG = np.random.default_rng(0)
@@ -140,3 +140,12 @@ def test_one_newton_step_is_the_nearest_rotation():
     rng = np.random.default_rng(5)
     frames = Rotation.random(50, random_state=4).as_matrix() + 1e-6 * rng.normal(size=(50, 3, 3))
     assert_allclose(orthonormal(frames), nearest_rotation(frames), atol=1e-11)
+
+
+def test_distances_of_places_are_those_of_numpy():
+    rng = np.random.default_rng(6)
+    spots, have = rng.normal(size=(9, 5, 3)), rng.random((9, 5)) < 0.7
+    away = np.zeros((9, 5, 5))
+    _distances(0, 9, spots, have, away)
+    every = np.linalg.norm(spots[:, :, None] - spots[:, None], axis=3)
+    assert_array_equal(away, np.where(have[:, None] & have[:, :, None], every, 0.0))

@@ -1,8 +1,9 @@
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from geomocap.model.small_systems import inverse_diagonal
@@ -20,7 +21,8 @@ from geomocap.patches.seeding import (
     spread,
     surface_frames,
 )
-from geomocap.patches.surface_patches import Patches, align, doubted, with_templates
+from geomocap.patches.surface_patches import Patches, align, as_one_camera, doubted, with_templates
+from geomocap.patches.template_store import TemplateStore
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
 
 SETTINGS = TrackingSettings(n_patches=150, radius_px=4, seed_every=4)
@@ -75,6 +77,16 @@ def test_spread_keeps_distance_and_covers():
     assert np.linalg.norm(chosen - taken, axis=1).min() > 0.09
     everything = np.concatenate([chosen, taken])
     assert np.linalg.norm(points[:, None] - everything[None], axis=2).min(axis=1).max() <= 0.1
+
+
+def test_points_are_kept_apart_as_one_after_the_other():
+    points = np.round(np.random.default_rng(2).uniform(0, 1, (3000, 3)) * [1, 1, 0.1], 2)  # many exactly as far apart
+    order, left, kept = np.random.default_rng(3).permutation(len(points)), np.ones(len(points), bool), []
+    for n in order:
+        if left[n]:
+            kept.append(n)
+            left &= ((points - points[n]) ** 2).sum(axis=1) > 0.05 * 0.05
+    assert_array_equal(spread(points, 0.05, points[:0], np.random.default_rng(3)), np.sort(kept))
 
 
 def test_surface_frames_follow_a_curved_surface(scene, views):
@@ -253,10 +265,9 @@ def test_templates_are_taken_again_as_asked(scene, views, seeds, templates, frac
     found = align(seeds, every, X, Q, seeds.has, views[1], iterations=(4, 8), least_correlation=0.6)
     fit = np.where(every[:, None] % 2, 0.8, 0.99)
     found = replace(found, by_camera=np.where(found.by_camera > -1, fit, -1.0))
-    copy = seeds.join(seeds.select(every[:0]))
     good = every % 5 > 0
-    again = renewed(copy.moved(X, Q), found, good, views[1], templates)
-    changed = (again.store.templates != seeds.store.templates).any(axis=(2, 3, 4)) & seeds.has
+    again = renewed(deepcopy(seeds).moved(X, Q), found, good, views[1], templates)
+    changed = (again.store.templates[again.rows] != seeds.store.templates[seeds.rows]).any(axis=(2, 3, 4)) & seeds.has
     taken = changed.any(axis=1)
     assert not taken[~good].any()
     if templates == "updated":
@@ -270,7 +281,7 @@ def test_a_patch_is_known_no_better_than_when_its_templates_were_taken(scene, vi
     found = align(seeds, every, X, Q, seeds.has, views[1], iterations=(4, 4), least_correlation=0.6)
     good = np.isfinite(found.sigma) & seeds.has.any(axis=1)
     assert np.array_equal(doubted(seeds, found).sigma, found.sigma)  # new patches are where they are
-    copy = seeds.select(every).join(Patches.empty(81, 6, 2))
+    copy = deepcopy(seeds)
     later = renewed(copy.moved(found.positions, found.frames), found, good, views[1], "previous")
     again = align(later, every, X, Q, later.has, views[1], iterations=(4, 4), least_correlation=0.6)
     both = doubted(later, again)
@@ -285,7 +296,7 @@ def test_cameras_whose_templates_are_in_doubt_move_a_patch_less(scene, views, se
     rows = np.flatnonzero(seeds.has.sum(axis=1) == 2)
     beside = 0.002 * Q[:, :, 0]
     astray = seeds.has & (np.arange(seeds.has.shape[1]) == seeds.has.argmax(axis=1)[:, None])
-    copy = seeds.join(seeds.select(rows[:0]))
+    copy = deepcopy(seeds)
     away = {}
     for doubt in (0.0, 0.01):
         later = with_templates(
@@ -319,6 +330,33 @@ def test_patches_can_be_selected_and_joined(seeds):
     empty = Patches.empty(81, 6, 2)
     assert len(empty) == 0 and len(empty.join(seeds)) == len(seeds)
     assert with_templates(empty, np.zeros((0, 6), bool), MovingEllipsoid().view(0)).has.shape == (0, 6)
+
+
+def test_rows_are_put_into_the_same_store_while_there_is_room():
+    numbers = np.arange(20.0, dtype=np.float32)[:, None, None, None, None] * np.ones((1, 2, 1, 4, 3), np.float32)
+    parts = [TemplateStore(numbers[k : k + 2].copy(), np.full((2, 2, 4), k, np.uint8), 2) for k in range(0, 8, 2)]
+    store, rows, stores = parts[0], np.arange(2), []
+    for part in parts[1:]:
+        store, old, new = store.join(rows, part, np.arange(2))
+        rows = np.append(old, new[0])  # the second one leaves
+        stores.append(store)
+        assert_array_equal(store.templates[rows, 1, 0, 0, 0], [0, 1, 2, 4, 6][: len(rows)])
+        assert_array_equal(store.usable[rows, 1, 0], [0, 0, 2, 4, 6][: len(rows)])
+    assert stores[1] is stores[0] and stores[2] is not stores[1]
+    assert store.used == 6 and len(store.templates) == 9
+
+
+def test_one_cameras_templates_serve_all_without_a_copy(views, seeds):
+    camera = seeds.has.argmax(axis=1)
+    shared = as_one_camera(seeds, camera, np.ones_like(seeds.has))
+    assert np.shares_memory(shared.store.templates, seeds.store.templates)
+    assert_array_equal(shared.store.templates[shared.rows, 0], seeds.store.templates[seeds.rows, camera])
+    every, only = np.arange(len(seeds)), np.arange(seeds.has.shape[1]) == camera[:, None]
+    places = seeds.positions + 0.002, seeds.frames
+    one, own = (
+        align(p, every, *places, only, views[0], iterations=(4, 8), least_correlation=0.5) for p in (shared, seeds)
+    )
+    assert_array_equal(one.positions, own.positions)
 
 
 def test_kernel_is_compiled_once_for_all(seeds):

@@ -2,14 +2,16 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import binary_erosion
+from scipy.spatial.transform import Rotation
 
 from geomocap.carving.silhouette_views import PinholeViews
 from geomocap.errors import GeometryError
 from geomocap.model.frame_geometry import Voxels
 from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.patch_prediction import lift_flow
+from geomocap.patches.surface_patches import facings, visible
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
 
 
@@ -35,6 +37,19 @@ def test_frame_views_have_depth_in_front_of_the_surface_and_no_background(scene,
     rim = (view.masks > 0) & ~np.stack([binary_erosion(m) for m in view.masks])
     inside = (view.masks > 0) & ~rim
     assert abs(view.levels[0][rim].mean() - view.levels[0][inside].mean()) < 8
+
+
+def test_cameras_that_see_patches_are_those_of_the_depths_and_cosines(views):
+    view, rng = views[0], np.random.default_rng(4)
+    positions = rng.uniform(-0.4, 0.4, (500, 3))
+    frames = Rotation.random(500, random_state=5).as_matrix()
+    hidden = np.where(rng.random((500, view.count)) < 0.3, np.nan, rng.normal(0, 0.1, (500, view.count)))
+    depth, surface = view.depths(positions)
+    behind = depth - surface - np.nan_to_num(np.maximum(hidden, 0.0))
+    slack = np.full((500, 1), 0.02)
+    expected = (facings(positions, frames[:, :, 2], view) > 0.2) & (behind < slack)
+    assert_array_equal(visible(positions, frames, hidden, view, slack, 0.2), expected)
+    assert 0 < expected.sum() < expected.size
 
 
 def test_points_outside_a_silhouette_are_not_the_subject(views):
