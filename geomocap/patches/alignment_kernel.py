@@ -31,7 +31,7 @@ from numba import njit
 
 from geomocap.model.small_systems import cholesky, inverse_diagonal, solve
 from geomocap.patches.patch_samples import choose_samples, compare, sum_of_products
-from geomocap.patches.patch_templates import local_camera, set_place, turn_by
+from geomocap.patches.patch_templates import fill_samples, local_camera, set_place, turn_by
 
 _FLOOR = 1.0  # noise of an image that even a perfect fit is granted, grey levels
 COHERENT = 0.15  # fraction of the samples over which residuals beyond that go together
@@ -67,7 +67,7 @@ def align_patches(
         Patches to align.
     X, Q : (N, 3), (N, 3, 3) float
         Places at the start; replaced by those found.
-    patches : shape (N, M, 5), size, rows (N,), templates (R, C, L, M, 3), usable (R, C, M), doubt (N, C)
+    patches : curvature (N, 3), size, radius, rows (N,), templates (R, C, L, M, 3), usable (R, C, M), doubt (N, C)
         Arrays of `Patches` and of their store, which may have one camera for all. Steps are limited in units of size.
     use : (N, C) uint8
         Cameras to align with.
@@ -90,10 +90,11 @@ def align_patches(
     covariance : (N, 6) float
         Filled: variances of shift (m²) and turn (rad²) along the patch's own axes; NaN without solution.
     """
-    shape, size, rows, templates, usable, doubt = patches
+    curvature, size, radius, rows, templates, usable, doubt = patches
     images, masks, P, centers = views
     prior_X, prior_Q, prior_shift, prior_turn = prior
-    M = shape.shape[1]
+    M = templates.shape[3]
+    shape = np.empty((M, 5))
     C = use.shape[1]
     A = np.empty((C, 3, 4))
     J = np.empty((C, 6, M), np.float32)
@@ -112,6 +113,7 @@ def align_patches(
     x_n, q_n, q_new = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     best_x, best_q = np.empty(3), np.empty((3, 3))
     for n in which[begin:end]:
+        fill_samples(curvature[n], size[n], radius[n], shape)
         set_place(x_n, q_n, X[n], Q[n])
         set_place(best_x, best_q, x_n, q_n)
         best = -2.0
@@ -129,7 +131,7 @@ def align_patches(
             own = min(c, templates.shape[1] - 1)  # all cameras may share one template
             seen_by = templates[rows[n], own, level], usable[rows[n], own], masks[c], use_mask
             filled = places[c], J[c], T[c], moments
-            counts[c] = choose_samples(A[c], local, shape[n], *seen_by, iterations > 0, stride, *filled)
+            counts[c] = choose_samples(A[c], local, shape, *seen_by, iterations > 0, stride, *filled)
             if counts[c] == 0:
                 continue
             seen += 1

@@ -25,6 +25,27 @@ def bilinear(image, x, y):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def fill_samples(curvature, size, radius, samples):
+    """Lay out a patch on a square grid: `samples` (M, 5) s, t, z (m), ∂z/∂s, ∂z/∂t; NaN beyond `radius` steps.
+
+    curvature : (3,) float
+        a, b, c of z = a s² + b s t + c t², per metre.
+    size : float, metres
+        Of a step.
+    """
+    side = int(math.sqrt(len(samples)) + 0.5)
+    a, b, c = curvature
+    for q in range(len(samples)):
+        i, j = q % side - side // 2, q // side - side // 2
+        if abs(i) > radius or abs(j) > radius:
+            samples[q] = np.nan
+            continue
+        s, t = size * i, size * j
+        samples[q, 0], samples[q, 1], samples[q, 2] = s, t, a * s * s + b * s * t + c * t * t
+        samples[q, 3], samples[q, 4] = 2 * a * s + b * t, b * s + 2 * c * t
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def local_camera(P, X, Q, A):
     """Projection of the patch's own coordinates: P [Q X; 0 1] into `A` (3, 4)."""
     for i in range(3):
@@ -62,15 +83,15 @@ def turn_by(Q, w0, w1, w2, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def take_templates(begin, end, X, Q, shape, rows, want, levels, masks, P, templates, usable):
+def take_templates(begin, end, X, Q, form, rows, want, levels, masks, P, templates, usable):
     """Take templates of patches in the cameras where `want` is 1.
 
     Parameters
     ----------
     X, Q : (N, 3), (N, 3, 3) float
         Places of the patches.
-    shape : (N, M, 5) float
-        Samples in the patch's frame and slopes of the surface: s, t, z, z_s, z_t; NaN where a narrow patch has none.
+    form : curvature (N, 3), size (N,), radius (N,)
+        Of the patches, see `fill_samples`.
     rows : (N,) int
         Where the patches have their templates.
     want : (N, C) uint8
@@ -86,10 +107,12 @@ def take_templates(begin, end, X, Q, shape, rows, want, levels, masks, P, templa
     C = want.shape[1]
     L = levels.shape[0]
     H, W = masks.shape[1:]
-    M = shape.shape[1]
-    A = np.empty((3, 4))
+    M = templates.shape[3]
+    A, shape = np.empty((3, 4)), np.empty((M, 5))
+    curvature, size, radius = form
     for n in range(begin, end):
         row = rows[n]
+        fill_samples(curvature[n], size[n], radius[n], shape)
         for c in range(C):
             if not want[n, c]:
                 continue
@@ -97,10 +120,10 @@ def take_templates(begin, end, X, Q, shape, rows, want, levels, masks, P, templa
             count, offered, total, square = 0, 0, 0.0, 0.0
             for q in range(M):
                 usable[row, c, q] = 0
-                if np.isnan(shape[n, q, 0]):
+                if np.isnan(shape[q, 0]):
                     continue
                 offered += 1
-                s, t, z, zs, zt = shape[n, q, 0], shape[n, q, 1], shape[n, q, 2], shape[n, q, 3], shape[n, q, 4]
+                s, t, z, zs, zt = shape[q, 0], shape[q, 1], shape[q, 2], shape[q, 3], shape[q, 4]
                 w = A[2, 0] * s + A[2, 1] * t + A[2, 2] * z + A[2, 3]
                 if w <= 0:
                     continue

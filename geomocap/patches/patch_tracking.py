@@ -17,8 +17,8 @@ from geomocap.patches.patch_prediction import orthonormal
 from geomocap.patches.patch_search import Followed, carry_lost, hiding_depth, judge, new_views, renewed, search
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.patches.reacquisition import reacquire
-from geomocap.patches.seeding import patch_radii, seed_for_one_camera, seed_patches, seed_spacing
-from geomocap.patches.surface_patches import SAME_SIDE, PatchAlignment, Patches, doubted, with_templates
+from geomocap.patches.seeding import patch_radii, seed_for_one_camera, seed_patches, seed_spacing, template_room
+from geomocap.patches.surface_patches import SAME_SIDE, PatchAlignment, doubted, with_templates
 from geomocap.patches.swings import find_pieces, lost_pieces
 from geomocap.patches.template_store import TemplateStore
 from geomocap.patches.track_record import TrackRecord
@@ -127,7 +127,7 @@ def track_surface(
             if state is not None and previous is not None:
                 state = _next(state, previous, view, settings, record, k, spacing, forward=False)
             if k > 0 and k in seeds:
-                fresh = _dressed(seeds[k], view)
+                fresh = _dressed(seeds[k], view, template_room(view, settings))
                 state = fresh if state is None else state.join(fresh)
             previous = view
         if state is not None:
@@ -161,11 +161,10 @@ def _bare(seeds: Followed) -> Followed:
     return Followed.begin(bare, seeds.identity, seeds.by_one)
 
 
-def _dressed(seeds: Followed, view: FrameViews) -> Followed:
+def _dressed(seeds: Followed, view: FrameViews, room: tuple[int, int, int]) -> Followed:
     """Take the templates of bare patches from the frame in which they were placed."""
-    p = seeds.patches
-    blank = Patches.without_templates(p.positions, p.frames, p.shape, p.size, view.count, len(view.levels))
-    return Followed.begin(with_templates(blank, p.has, view), seeds.identity, seeds.by_one)
+    blank = seeds.patches.cleared(room)
+    return Followed.begin(with_templates(blank, seeds.patches.has, view), seeds.identity, seeds.by_one)
 
 
 def _next(

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from geomocap.model.rotations import rigid_motion
 from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.piece_textures import ANGLES, best_matches, likenesses, patch_radius, textures_of
-from geomocap.patches.seeding import patch_shape, spread, surface_frames
+from geomocap.patches.seeding import spread, surface_frames
 from geomocap.patches.surface_patches import (
     FACING_OTHERS,
     SAME_SIDE,
@@ -67,13 +67,14 @@ def free_places(taken: np.ndarray, patches: Patches, view: FrameViews, spacing: 
     if len(taken):
         free = free[cKDTree(taken).query(free)[0] > _FREE * spacing]
     C, (L, M) = view.count, patches.store.templates.shape[2:4]
+    room = M, C, L
     if not len(free):
-        return Patches.empty(M, C, L)
+        return Patches.empty(room)
     distance = max(_DENSE * spacing, view.voxel_size * float(np.sqrt(len(free) / _MOST_PLACES)))
     points = free[spread(free, distance, np.zeros((0, 3)), np.random.default_rng(0))]
     positions, frames, curvature = surface_frames(view, points)
     size = np.full(len(positions), np.median(patches.size))
-    blank = Patches.without_templates(positions, frames, patch_shape(curvature, size, patch_radius(M)), size, C, L)
+    blank = Patches.without_templates(positions, frames, curvature, size, patch_radius(M), room)
     slack = np.full((len(points), 1), _HULL_VOXELS * view.voxel_size)
     seen = visible(positions, frames, blank.hidden, view, slack, FACING_OTHERS)
     best = np.where(seen, facings(positions, blank.normals, view), -2).argmax(axis=1)

@@ -53,6 +53,11 @@ def patch_radii(view: FrameViews, spacing: float, settings: TrackingSettings) ->
     return min(settings.radius_px, wide), min(settings.radius_px, narrow)
 
 
+def template_room(view: FrameViews, settings: TrackingSettings) -> tuple[int, int, int]:
+    """Return how many samples the widest patches have, and the numbers of cameras and blur levels."""
+    return (2 * settings.radius_px + 1) ** 2, view.count, len(view.levels)
+
+
 def spread(points: np.ndarray, spacing: float, taken: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Choose points (M, 3), `spacing` from each other and 0.9 of it from those `taken` (K, 3): indices, sorted."""
     free = np.ones(len(points), bool)
@@ -137,29 +142,6 @@ def surface_frames(view: FrameViews, points: np.ndarray) -> tuple[np.ndarray, np
     return positions, frames, np.clip(fit[:, 3:], -0.5 / radius, 0.5 / radius)
 
 
-def patch_shape(curvature: np.ndarray, size: np.ndarray, radius_px: int, narrow_px: int | None = None) -> np.ndarray:
-    """Return samples of patches on a square grid: (N, M, 5) s, t, z (m), ∂z/∂s, ∂z/∂t.
-
-    Parameters
-    ----------
-    curvature : (N, 3) float, per metre
-    size : (N,) float
-        Spacing of the samples, metres.
-    radius_px : int
-        M = (2 radius_px + 1)² samples.
-    narrow_px : int, optional
-        The samples beyond are NaN: narrow patches among wide ones.
-    """
-    steps = np.arange(-radius_px, radius_px + 1)
-    s, t = (np.outer(size, g.ravel()) for g in np.meshgrid(steps, steps))
-    a, b, c = (curvature[:, k, None] for k in range(3))
-    shape = np.stack([s, t, a * s * s + b * s * t + c * t * t, 2 * a * s + b * t, b * s + 2 * c * t], axis=2)
-    if narrow_px is not None:
-        far = np.abs(steps) > narrow_px
-        shape[:, (far[:, None] | far).ravel()] = np.nan
-    return shape
-
-
 def seed_patches(
     view: FrameViews,
     taken: np.ndarray,
@@ -181,8 +163,7 @@ def seed_patches(
     settings : TrackingSettings
     rng : numpy.random.Generator
     """
-    M, C, L = (2 * settings.radius_px + 1) ** 2, view.count, len(view.levels)
-    patches = Patches.empty(M, C, L)
+    patches = Patches.empty(template_room(view, settings))
     tree = cKDTree(view.surface)
     tried = np.zeros(len(view.surface), bool)
     wide, narrow = patch_radii(view, spacing, settings)
@@ -209,7 +190,7 @@ def seed_for_one_camera(
     there = view.surface[cKDTree(view.surface).query(taken)[1]]
     points = view.surface[spread(view.surface, spacing, there, rng)]
     wide, narrow = patch_radii(view, spacing, settings)
-    patches = Patches.empty((2 * settings.radius_px + 1) ** 2, view.count, len(view.levels))
+    patches = Patches.empty(template_room(view, settings))
     for radius in dict.fromkeys((narrow, wide)):
         patches = patches.join(_precise_alone(points, view, settings, radius))
         if len(patches):
@@ -251,8 +232,8 @@ def _blank(
     positions, frames, curvature, cosine, seen = (a[good] for a in (positions, frames, curvature, cosine, seen))
     best = np.where(seen, cosine, -1).argmax(axis=1)
     size = view.pixel_size(positions)[np.arange(len(positions)), best]
-    shape = patch_shape(curvature, size, settings.radius_px, radius_px)
-    blank = Patches.without_templates(positions, frames, shape, size, view.count, len(view.levels))
+    room = template_room(view, settings)
+    blank = Patches.without_templates(positions, frames, curvature, size, radius_px, room)
     return blank, seen, cosine
 
 
@@ -270,7 +251,7 @@ def _lock(
     patches: Patches, seen: np.ndarray, reference: np.ndarray, view: FrameViews, settings: TrackingSettings
 ) -> Patches:
     """Sweep patches along the reference camera's ray, align them there, and take every camera's own template."""
-    N, C = seen.shape
+    N = len(seen)
     rows, every = np.arange(N), np.arange(N)
     # all cameras look for what the reference camera saw
     shared = as_one_camera(patches, reference, seen)
@@ -310,11 +291,7 @@ def _lock(
     keep &= (found.sigma < settings.sigma_px * patches.size) & view.may_be_subject(found.positions)
     agree[rows, reference] = True
     patches = patches.moved(found.positions, found.frames).select(keep)
-    own = with_templates(
-        Patches.without_templates(patches.positions, patches.frames, patches.shape, patches.size, C, len(view.levels)),
-        agree[keep],
-        view,
-    )
+    own = with_templates(patches.cleared(template_room(view, settings)), agree[keep], view)
     return own.select(np.flatnonzero(own.has.sum(axis=1) >= settings.n_views))
 
 

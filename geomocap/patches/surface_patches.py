@@ -15,7 +15,7 @@ from geomocap.scheduling import spread
 
 _FEW = 32  # patches that are not worth waking other threads for
 _COARSE_STRIDE = 2  # of the samples, on blurred levels
-_OWN = ("positions", "frames", "shape", "size", "rows", "has", "hidden", "doubt")
+_OWN = ("positions", "frames", "curvature", "size", "radius", "rows", "has", "hidden", "doubt")
 FACING_OTHERS = 0.35  # cosine from which a camera looks for what another one has seen
 SAME_SIDE = 0.5  # cosine between normals of patches on the same side of a limb
 
@@ -88,11 +88,12 @@ class Patches:
         Where they are now.
     frames : (N, 3, 3) float
         World from patch frame, rotations; third axis: outward normal.
-    shape : (N, M, 5) float
-        Samples in the patch's frame and slopes of the surface there: s, t, z (m), ∂z/∂s, ∂z/∂t; NaN where a narrow
-        patch has none.
+    curvature : (N, 3) float
+        a, b, c of the surface z = a s² + b s t + c t² in the patch's frame, per metre.
     size : (N,) float
         Spacing of the samples: about a pixel, metres.
+    radius : (N,) int
+        Half the width in samples; narrow patches have fewer than M.
     rows : (N,) int
         Where each has its templates in the store.
     store : TemplateStore
@@ -107,8 +108,9 @@ class Patches:
 
     positions: np.ndarray
     frames: np.ndarray
-    shape: np.ndarray
+    curvature: np.ndarray
     size: np.ndarray
+    radius: np.ndarray
     rows: np.ndarray
     store: TemplateStore
     has: np.ndarray
@@ -119,28 +121,39 @@ class Patches:
         return len(self.positions)
 
     @classmethod
-    def empty(cls, n_samples: int, n_cameras: int, n_levels: int) -> Patches:
-        """Return no patches."""
-        M, C, L = n_samples, n_cameras, n_levels
-        return cls.without_templates(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, M, 5)), np.zeros(0), C, L)
+    def empty(cls, room: tuple[int, int, int]) -> Patches:
+        """Return no patches, for samples M, cameras C and levels L."""
+        none = np.zeros((0, 3))
+        return cls.without_templates(none, none.reshape(0, 3, 3), none, np.zeros(0), 0, room)
 
     @classmethod
     def without_templates(
-        cls, positions: np.ndarray, frames: np.ndarray, shape: np.ndarray, size: np.ndarray, C: int, L: int
+        cls,
+        positions: np.ndarray,
+        frames: np.ndarray,
+        curvature: np.ndarray,
+        size: np.ndarray,
+        radius: np.ndarray | int,
+        room: tuple[int, int, int],
     ) -> Patches:
-        """Return patches that no camera has a template of yet."""
-        N, M = shape.shape[:2]
+        """Return patches that no camera has a template of yet; `room` for samples M, cameras C and levels L."""
+        N, (M, C, L) = len(positions), room
         return cls(
             np.array(positions, np.float64),
             np.array(frames, np.float64),
-            shape,
+            curvature,
             size,
+            np.full(N, radius),
             np.arange(N),
             TemplateStore.blank(N, C, L, M),
             np.zeros((N, C), bool),
             np.full((N, C), np.nan),
             np.zeros((N, C)),
         )
+
+    def cleared(self, room: tuple[int, int, int]) -> Patches:
+        """Return them without the templates, with `room` for others, see `without_templates`."""
+        return self.without_templates(self.positions, self.frames, self.curvature, self.size, self.radius, room)
 
     def select(self, which: np.ndarray) -> Patches:
         """Return some of them, by a mask or by positions."""
@@ -238,7 +251,7 @@ def with_templates(patches: Patches, want: np.ndarray, view: FrameViews, sigma: 
         len(took),
         patches.positions,
         patches.frames,
-        patches.shape,
+        (patches.curvature, patches.size, patches.radius),
         patches.rows,
         took,
         view.levels,
@@ -319,6 +332,7 @@ def align(
     correlation = np.full((N, C), -1.0)
     covariance = np.full((N, 6), np.nan)
     expected = (X.copy(), Q.copy()) if prior is None else prior
+    form = patches.curvature, patches.size, patches.radius
     for level, count in enumerate(iterations):
         if count < 0:
             continue
@@ -328,7 +342,7 @@ def align(
             which,
             X,
             Q,
-            (patches.shape, patches.size, patches.rows, patches.store.templates, patches.store.usable, patches.doubt),
+            (*form, patches.rows, patches.store.templates, patches.store.usable, patches.doubt),
             np.ascontiguousarray(use, np.uint8),
             (view.levels[level], view.masks, view.projections, view.centers),
             level,

@@ -75,7 +75,7 @@ def test_where_narrow_patches_hold_too_little_texture_there_are_wide_ones(views)
     spacing, none = 0.02, np.zeros((0, 3))  # five pixels
     settings = TrackingSettings(radius_px=8)
     seeds = seed_for_one_camera(plain, none, spacing, settings, np.random.default_rng(0))
-    width = np.sqrt(np.isfinite(seeds.shape[:, :, 0]).sum(axis=1))
+    width = 2 * seeds.radius + 1
     narrow, wide = seeds.positions[width == 11], seeds.positions[width == 17]
     assert len(narrow) + len(wide) == len(seeds) and len(wide) > 2 * len(narrow) > 0
     # they stand where the others don't
@@ -88,4 +88,4 @@ def test_where_narrow_patches_hold_too_little_texture_there_are_wide_ones(views)
 def test_where_texture_suffices_all_are_narrow(views):
     settings = TrackingSettings(radius_px=8)
     seeds = seed_for_one_camera(views[0], np.zeros((0, 3)), 0.02, settings, np.random.default_rng(0))
-    assert (np.isfinite(seeds.shape[:, :, 0]).sum(axis=1) == 11**2).mean() > 0.9
+    assert (seeds.radius == 5).mean() > 0.9

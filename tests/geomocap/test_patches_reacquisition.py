@@ -7,7 +7,7 @@ from geomocap.patches.patch_search import hiding_depth
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.patches.reacquisition import reacquire
 from geomocap.patches.seeding import seed_patches, seed_spacing
-from geomocap.patches.surface_patches import Patches, with_templates
+from geomocap.patches.surface_patches import with_templates
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
 
 SCENE = MovingEllipsoid(n_cameras=8, turn_deg=(0, 0, 45.0), shift=(0.0, 0.0, 0.0))
@@ -23,8 +23,7 @@ def test_after_a_turn_a_patch_is_known_again_by_the_next_cameras():
     # a turn by the angle between cameras: what camera c saw, camera c + 1 sees now; nobody may use its own template
     only = np.zeros_like(seeds.has)
     only[np.arange(len(seeds)), seeds.has.argmax(axis=1)] = True
-    p = seeds
-    known = with_templates(Patches.without_templates(p.positions, p.frames, p.shape, p.size, 8, 2), only, views[0])
+    known = with_templates(seeds.cleared((81, 8, 2)), only, views[0])
     rng = np.random.default_rng(1)
     carried = known.moved(truth + rng.normal(0, 0.004, truth.shape), turn @ seeds.frames)
     lost = np.ones(len(seeds), bool)

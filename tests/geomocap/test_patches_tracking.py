@@ -11,11 +11,11 @@ from geomocap.model.trajectories import REASONS
 from geomocap.patches.alignment_kernel import align_patches
 from geomocap.patches.patch_search import renewed
 from geomocap.patches.patch_settings import TrackingSettings
+from geomocap.patches.patch_templates import fill_samples
 from geomocap.patches.patch_tracking import track_surface
 from geomocap.patches.seeding import (
     image_reduction,
     patch_radii,
-    patch_shape,
     seed_patches,
     seed_spacing,
     spread,
@@ -59,12 +59,26 @@ def test_patches_are_as_wide_as_their_distance_within_bounds(views):
     assert patch_radii(views[0], pixel, TrackingSettings(radius_px=2)) == (2, 2)
 
 
+def samples_of(curvature, size, radius, most):
+    samples = np.empty(((2 * most + 1) ** 2, 5))
+    fill_samples(np.asarray(curvature), size, radius, samples)
+    return samples
+
+
 def test_narrow_patches_have_the_middle_samples_of_wide_ones():
-    curvature, size = np.array([[1.0, 0.5, -2.0]]), np.array([0.003])
-    wide, narrow = patch_shape(curvature, size, 4, 2), patch_shape(curvature, size, 2)
-    middle = wide.reshape(1, 9, 9, 5)[:, 2:7, 2:7].reshape(1, 25, 5)
-    assert_allclose(middle, narrow)
-    assert np.isnan(wide).all(axis=2).sum() == 81 - 25
+    curvature, size = [-3.0, 1.0, -2.0], 0.002
+    wide, narrow, full = (samples_of(curvature, size, *r) for r in ((2, 4), (2, 2), (4, 4)))
+    middle = wide.reshape(9, 9, 5)[2:-2, 2:-2].reshape(25, 5)
+    assert_array_equal(middle, narrow)
+    assert_array_equal(middle, full.reshape(9, 9, 5)[2:-2, 2:-2].reshape(25, 5))
+    assert np.isnan(wide).all(axis=1).sum() == 81 - 25
+
+
+def test_samples_lie_on_a_paraboloid_row_by_row():
+    (a, b, c), size = (-3.0, 1.0, -2.0), 0.002
+    s, t = (size * g.ravel() for g in np.meshgrid(np.arange(-3, 4), np.arange(-3, 4)))
+    expected = [s, t, a * s * s + b * s * t + c * t * t, 2 * a * s + b * t, b * s + 2 * c * t]
+    assert_array_equal(samples_of((a, b, c), size, 3, 3), np.stack(expected, axis=1))
 
 
 def test_spread_keeps_distance_and_covers():
@@ -103,8 +117,7 @@ def test_surface_frames_follow_a_curved_surface(scene, views):
 
 
 def test_shape_and_slopes_belong_together():
-    shape = patch_shape(np.array([[-3.0, 1.0, -2.0]]), np.array([0.002]), 3)[0]
-    grid = shape.reshape(7, 7, 5)
+    grid = samples_of([-3.0, 1.0, -2.0], 0.002, 3, 3).reshape(7, 7, 5)
     assert_allclose(np.gradient(grid[:, :, 2], 0.002, axis=1)[:, 1:-1], grid[:, 1:-1, 3], atol=1e-12)
     assert_allclose(np.gradient(grid[:, :, 2], 0.002, axis=0)[1:-1], grid[1:-1, :, 4], atol=1e-12)
 
@@ -158,9 +171,10 @@ def test_alignment_keeps_to_its_expectation_where_nothing_is_seen(scene, views, 
 
 def reference_step(patches, n, X, Q, view, level, size):
     """One Gauss–Newton step by numerical differentiation of the images themselves, offset and gain as unknowns."""
+    grid = samples_of(patches.curvature[n], patches.size[n], patches.radius[n], 4)
 
     def sample(x, q, c):
-        p = patches.shape[n, patches.store.usable[n, c] > 0, :3] @ q.T + x
+        p = grid[patches.store.usable[n, c] > 0, :3] @ q.T + x
         h = np.c_[p, np.ones(len(p))] @ view.projections[c].T
         u, v = h[:, 0] / h[:, 2], h[:, 1] / h[:, 2]
         i, j = u.astype(int), v.astype(int)
@@ -327,7 +341,7 @@ def test_tracking_repeats_bit_for_bit(views):
 def test_patches_can_be_selected_and_joined(seeds):
     both = seeds.select(np.arange(3)).join(seeds.select(np.arange(3, 5)))
     assert_allclose(both.positions, seeds.positions[:5])
-    empty = Patches.empty(81, 6, 2)
+    empty = Patches.empty((81, 6, 2))
     assert len(empty) == 0 and len(empty.join(seeds)) == len(seeds)
     assert with_templates(empty, np.zeros((0, 6), bool), MovingEllipsoid().view(0)).has.shape == (0, 6)
 
