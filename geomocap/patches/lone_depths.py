@@ -10,6 +10,7 @@ held where the volume puts it, with its standard deviation.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
@@ -17,6 +18,7 @@ from scipy.sparse.linalg import spsolve
 
 from geomocap.model.rotations import nearest_rotation
 from geomocap.model.trajectories import Trajectories
+from geomocap.scheduling import map_items, threads
 from geomocap.trajectories.completion import nearest_companions
 
 _COMPANIONS = 12  # of a patch
@@ -73,22 +75,48 @@ def adjust_depths(tracks: Trajectories) -> Trajectories:
     for _ in range(_ROUNDS):
         total, square, weight = np.zeros((len(first), 3)), np.zeros(len(first)), np.zeros(len(first))
         count = np.zeros(len(first))
-        for t in range(tracks.n_frames):
-            edges = np.flatnonzero(has[first, t] & has[second, t])
-            if not len(edges):
-                continue
-            turn = _rotations(positions[:, t], shape, edges, depth_std)
-            w, kept = _weights(positions[:, t], turn, shape, edges, depth_std)
-            positions[:, t] += _shift(place[:, t], positions[:, t], directions[:, t], kept, w, shape, edges, depth_std)
-            i, j = first[edges], second[edges]
-            seen = np.einsum("eji,ej->ei", turn[i], positions[j, t] - positions[i, t])
-            total[edges] += w[:, None] * seen
-            weight[edges] += w
-            square[edges] += ((seen - shape.offset[edges]) ** 2).sum(axis=1)
-            count[edges] += 1
+        frame = partial(_adjusted, place, positions, directions, has, shape, depth_std)
+        with threads() as executor:
+            for t, (edges, shift, w, seen) in enumerate(map_items(frame, range(tracks.n_frames), executor)):
+                positions[:, t] += shift
+                total[edges] += w[:, None] * seen
+                weight[edges] += w
+                square[edges] += ((seen - shape.offset[edges]) ** 2).sum(axis=1)
+                count[edges] += 1
         offset = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-12)[:, None], shape.offset)
         shape = replace(shape, offset=offset, spread=np.sqrt(square / np.maximum(count, 1)))
     return replace(tracks, positions=np.where(has[:, :, None], positions, np.nan))
+
+
+def _adjusted(
+    place: np.ndarray,
+    positions: np.ndarray,
+    directions: np.ndarray,
+    has: np.ndarray,
+    shape: _Shape,
+    depth_std: float,
+    t: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Adjust the depths of one frame.
+
+    Returns
+    -------
+    edges : (F,) int
+        Neighbours that are both measured.
+    shift : (N, 3) float, metres
+    weights : (F,) float
+    seen : (F, 3) float, metres
+        Where the companions lie then, in the neighbourhood's frame.
+    """
+    edges = np.flatnonzero(has[shape.first, t] & has[shape.second, t])
+    if not len(edges):
+        return edges, np.zeros_like(place[:, t]), np.zeros(0), np.zeros((0, 3))
+    turn = _rotations(positions[:, t], shape, edges, depth_std)
+    w, kept = _weights(positions[:, t], turn, shape, edges, depth_std)
+    shift = _shift(place[:, t], positions[:, t], directions[:, t], kept, w, shape, edges, depth_std)
+    moved = positions[:, t] + shift
+    i, j = shape.first[edges], shape.second[edges]
+    return edges, shift, w, np.einsum("eji,ej->ei", turn[i], moved[j] - moved[i])
 
 
 def _first_shape(

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from geomocap.patches.alignment_kernel import COHERENT
 from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.surface_patches import PatchAlignment, Patches, align
+from geomocap.scheduling import spread
 
 DEPTH_PX = 3.0  # standard deviation of the depth, sample spacings
 _TURN = 0.15  # rad; a single view hardly shows turns out of its plane
@@ -70,13 +71,14 @@ def image_precision(patches: Patches, which: np.ndarray, camera: np.ndarray, cor
     """
     result = np.empty(len(which))
     store = patches.store
-    _image_precision(store.templates, store.usable, patches.rows[which], camera, correlation, result)
+    arrays = store.templates, store.usable, patches.rows[which], camera, correlation, result
+    spread(_image_precision, len(which), *arrays)
     return result
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _image_precision(templates, usable, rows, camera, correlation, result):
-    for n in range(len(rows)):
+def _image_precision(begin, end, templates, usable, rows, camera, correlation, result):
+    for n in range(begin, end):
         template, has = templates[rows[n], camera[n], -1], usable[rows[n], camera[n]]
         count, sums, products = 0, np.zeros(3), np.zeros((3, 3))
         for m in range(len(has)):

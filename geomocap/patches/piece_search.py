@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from geomocap.model.rotations import rigid_motion
 from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.piece_textures import ANGLES, best_matches, likenesses, patch_radius, textures_of
-from geomocap.patches.seeding import spread, surface_frames
+from geomocap.patches.seeding import spaced, surface_frames
 from geomocap.patches.surface_patches import (
     FACING_OTHERS,
     SAME_SIDE,
@@ -30,6 +30,7 @@ from geomocap.patches.surface_patches import (
     visible,
     with_templates,
 )
+from geomocap.scheduling import spread
 
 _FREE = 1.5  # spacings from the nearest patch
 _DENSE = 0.7  # distance of the places looked at, spacings,
@@ -71,7 +72,7 @@ def free_places(taken: np.ndarray, patches: Patches, view: FrameViews, spacing: 
     if not len(free):
         return Patches.empty(room)
     distance = max(_DENSE * spacing, view.voxel_size * float(np.sqrt(len(free) / _MOST_PLACES)))
-    points = free[spread(free, distance, np.zeros((0, 3)), np.random.default_rng(0))]
+    points = free[spaced(free, distance, np.zeros((0, 3)), np.random.default_rng(0))]
     positions, frames, curvature = surface_frames(view, points)
     size = np.full(len(positions), np.median(patches.size))
     blank = Patches.without_templates(positions, frames, curvature, size, patch_radius(M), room)
@@ -179,7 +180,8 @@ def _promising(
     for who, count in ((some, _LOOKED_AT), (np.arange(len(piece)), 2 * _LIKELY)):
         value = np.empty(len(turns), np.float32)
         own = piece.positions[who], piece.frames[who]
-        together(turns, shifts, *own, who, places.frames, alike, low, _CELL * spacing, cells, value)
+        grid = low, _CELL * spacing, cells
+        spread(together, len(turns), turns, shifts, *own, who, places.frames, alike, *grid, value)
         likely = np.argsort(-value, kind="stable")[:count]
         turns, shifts = turns[likely], shifts[likely]
     inside = view.may_be_subject((X @ turns.swapaxes(1, 2) + shifts[:, None]).reshape(-1, 3))
@@ -226,7 +228,7 @@ def fill_cells(positions, low, edge, reach, cells, squared):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def together(turns, shifts, X, Q, who, frames, alike, low, edge, cells, value):
+def together(begin, end, turns, shifts, X, Q, who, frames, alike, low, edge, cells, value):
     """How much m patches look like the places next to which K motions put them, on average: into `value` (K,).
 
     Parameters
@@ -245,7 +247,7 @@ def together(turns, shifts, X, Q, who, frames, alike, low, edge, cells, value):
     """
     A, m = len(alike), len(X)
     y, turned = np.empty(3), np.empty((3, 3))
-    for n in range(len(turns)):
+    for n in range(begin, end):
         total = 0.0
         for p in range(m):
             inside = True

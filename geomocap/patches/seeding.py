@@ -58,7 +58,7 @@ def template_room(view: FrameViews, settings: TrackingSettings) -> tuple[int, in
     return (2 * settings.radius_px + 1) ** 2, view.count, len(view.levels)
 
 
-def spread(points: np.ndarray, spacing: float, taken: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def spaced(points: np.ndarray, spacing: float, taken: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Choose points (M, 3), `spacing` from each other and 0.9 of it from those `taken` (K, 3): indices, sorted."""
     free = np.ones(len(points), bool)
     if len(taken):
@@ -171,7 +171,7 @@ def seed_patches(
         candidates = np.flatnonzero(~tried)
         # a hull stands off the true surface: what is there already counts where it shows on the hull
         there = view.surface[tree.query(np.concatenate([taken, patches.positions]))[1]]
-        chosen = candidates[spread(view.surface[candidates], spacing, there, rng)]
+        chosen = candidates[spaced(view.surface[candidates], spacing, there, rng)]
         if not len(chosen):
             break
         tried[chosen] = True
@@ -188,7 +188,7 @@ def seed_for_one_camera(
     these hold too little texture to tell how they move, wide ones. Parameters as for `seed_patches`.
     """
     there = view.surface[cKDTree(view.surface).query(taken)[1]]
-    points = view.surface[spread(view.surface, spacing, there, rng)]
+    points = view.surface[spaced(view.surface, spacing, there, rng)]
     wide, narrow = patch_radii(view, spacing, settings)
     patches = Patches.empty(template_room(view, settings))
     for radius in dict.fromkeys((narrow, wide)):

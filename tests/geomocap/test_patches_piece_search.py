@@ -28,7 +28,7 @@ def test_likeness_of_pieces_is_that_of_numpy():
     alike, who = rng.uniform(-1, 1, (A, m + 3, P)).astype(np.float32), rng.permutation(m + 3)[:m]
     low, cells = np.zeros(3), rng.integers(-1, P, (10, 10, 10)).astype(np.int32)
     value = np.empty(K, np.float32)
-    together(turns, shifts, X, Q, who, frames, alike, low, edge, cells, value)
+    together(0, len(turns), turns, shifts, X, Q, who, frames, alike, low, edge, cells, value)
     at = np.floor((X @ turns.swapaxes(1, 2) + shifts[:, None] - low) / edge).astype(int)
     inside = ((at >= 0) & (at < 10)).all(axis=2)
     place = np.where(inside, cells[tuple(np.moveaxis(at.clip(0, 9), 2, 0))], -1)

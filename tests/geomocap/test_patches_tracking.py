@@ -18,7 +18,7 @@ from geomocap.patches.seeding import (
     patch_radii,
     seed_patches,
     seed_spacing,
-    spread,
+    spaced,
     surface_frames,
 )
 from geomocap.patches.surface_patches import Patches, align, as_one_camera, doubted, with_templates
@@ -81,11 +81,11 @@ def test_samples_lie_on_a_paraboloid_row_by_row():
     assert_array_equal(samples_of((a, b, c), size, 3, 3), np.stack(expected, axis=1))
 
 
-def test_spread_keeps_distance_and_covers():
+def test_spaced_points_keep_distance_and_covers():
     rng = np.random.default_rng(1)
     points = rng.uniform(0, 1, (2000, 3)) * [1, 1, 0]
     taken = np.array([[0.5, 0.5, 0]])
-    chosen = points[spread(points, 0.1, taken, np.random.default_rng(0))]
+    chosen = points[spaced(points, 0.1, taken, np.random.default_rng(0))]
     gaps = np.linalg.norm(chosen[:, None] - chosen[None], axis=2) + 9 * np.eye(len(chosen))
     assert gaps.min() > 0.1
     assert np.linalg.norm(chosen - taken, axis=1).min() > 0.09
@@ -100,7 +100,7 @@ def test_points_are_kept_apart_as_one_after_the_other():
         if left[n]:
             kept.append(n)
             left &= ((points - points[n]) ** 2).sum(axis=1) > 0.05 * 0.05
-    assert_array_equal(spread(points, 0.05, points[:0], np.random.default_rng(3)), np.sort(kept))
+    assert_array_equal(spaced(points, 0.05, points[:0], np.random.default_rng(3)), np.sort(kept))
 
 
 def test_surface_frames_follow_a_curved_surface(scene, views):
