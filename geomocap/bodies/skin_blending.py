@@ -404,7 +404,7 @@ def explain(
         positions,
         weights,
         ray,
-        rest,
+        np.ascontiguousarray(rest),
         certain,
         rotations,
         translations,
