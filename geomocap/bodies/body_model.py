@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_matrix
 
 from geomocap.bodies.rigid_motions import fit_rigid_motion
 from geomocap.bodies.skin_blending import Blends, explain, places_at_rest
-from geomocap.scheduling import map_here
 
 _LEAST_CONTACTS = 3
 _LEAST_FRACTION = 0.3
@@ -198,50 +197,26 @@ def refit(model: BodyModel, evidence: Evidence, bodies: np.ndarray) -> BodyModel
     weight w². So the soft samples tell how far a body turns too, instead of pulling its motion towards its neighbours'.
     """
     rotations, translations = model.rotations.copy(), model.translations.copy()
-    fit = partial(_fit_body, model, evidence, rotations, translations)
-    for wave in _waves(model, bodies):
-        for b, motion in zip(wave, map_here(fit, wave), strict=True):
-            if motion is not None:
-                rotations[b], translations[b] = motion
-    return replace(model, rotations=rotations, translations=translations)
-
-
-def _waves(model: BodyModel, bodies: np.ndarray) -> list[list[int]]:
-    """Bodies in groups to be fitted at once, of which none blends with another: as if one after another in their order.
-
-    Each comes after those before it that it blends with, and before those after it.
-    """
-    blended = (model.partner >= 0) & (model.fraction < 1.0)
-    linked = np.zeros((model.count, model.count), bool)
-    linked[model.label[blended], model.partner[blended]] = True
-    linked |= linked.T
-    depth = np.zeros(model.count, int)  # of those not yet reached 0
     for b in bodies:
-        depth[b] = 1 + depth[linked[b]].max(initial=0)
-    return [[int(b) for b in bodies if depth[b] == k] for k in range(1, depth.max(initial=0) + 1)]
-
-
-def _fit_body(
-    model: BodyModel, evidence: Evidence, rotations: np.ndarray, translations: np.ndarray, b: int
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Motion of one body, (T, 3, 3), (T, 3), given those of all, see `refit`; None if it has no samples."""
-    mine = np.flatnonzero(model.label == b)
-    if not len(mine):
-        return None
-    shared = np.flatnonzero((model.partner == b) & (1.0 - model.fraction > _LEAST_FRACTION))
-    members = np.concatenate([mine, shared])
-    part = np.concatenate([model.fraction[mine], 1.0 - model.fraction[shared]])
-    other = np.concatenate([model.partner[mine], model.label[shared]])
-    seen = evidence.positions[members]
-    rest = evidence.rest[members]
-    for q in np.unique(other[(other >= 0) & (part < 1.0)]):
-        of = np.flatnonzero((other == q) & (part < 1.0))
-        w = part[of][:, None, None]
-        carried = carry(rotations[q], translations[q], rest[of])
-        seen[of] = (seen[of] - (1.0 - w) * carried) / w
-    weights = evidence.weights[members] * (part**2)[:, None]
-    ray = None if evidence.ray is None else evidence.ray[members]
-    return fit_rigid_motion(seen, rest, weights, evidence.noise, ray=ray)[:2]
+        mine = np.flatnonzero(model.label == b)
+        if not len(mine):
+            continue
+        shared = np.flatnonzero((model.partner == b) & (1.0 - model.fraction > _LEAST_FRACTION))
+        members = np.concatenate([mine, shared])
+        part = np.concatenate([model.fraction[mine], 1.0 - model.fraction[shared]])
+        other = np.concatenate([model.partner[mine], model.label[shared]])
+        seen = evidence.positions[members]
+        rest = evidence.rest[members]
+        for q in np.unique(other[(other >= 0) & (part < 1.0)]):
+            of = np.flatnonzero((other == q) & (part < 1.0))
+            w = part[of][:, None, None]
+            carried = carry(rotations[q], translations[q], rest[of])
+            seen[of] = (seen[of] - (1.0 - w) * carried) / w
+        weights = evidence.weights[members] * (part**2)[:, None]
+        rotations[b], translations[b], _ = fit_rigid_motion(
+            seen, rest, weights, evidence.noise, ray=None if evidence.ray is None else evidence.ray[members]
+        )
+    return replace(model, rotations=rotations, translations=translations)
 
 
 def settle_rest(model: BodyModel, evidence: Evidence) -> Evidence:

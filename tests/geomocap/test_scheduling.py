@@ -6,17 +6,12 @@ import os
 import subprocess
 import sys
 import threading
-from dataclasses import replace
 
 import cv2
 import numba
-import numpy as np
 import pytest
-from scipy.sparse import csr_matrix
 
-from geomocap.bodies.body_model import Evidence, model_of_labels, refit
 from geomocap.scheduling import limit_threads, map_items, spread, threads
-from tests.geomocap.test_surface_samples import loose_body
 
 
 def test_results_come_in_order_and_progress_is_told():
@@ -92,47 +87,6 @@ def test_a_limit_holds_for_executors_and_kernels_made_afterwards():
     with threads() as executor:
         assert executor._max_workers == (os.cpu_count() or 1)
     assert numba.get_num_threads() == numba.config.NUMBA_NUM_THREADS
-
-
-@pytest.mark.parametrize("rays", [False, True])
-def test_bodies_are_fitted_as_one_after_another_for_any_number_of_threads(rays):
-    positions, rest, weights, ray = loose_body(120, 20)
-    nothing, empty, open_places = np.zeros(120), csr_matrix((120, 120)), np.zeros(120, bool)
-    evidence = Evidence(
-        positions,
-        weights,
-        weights > 0,
-        nothing,
-        ray if rays else None,
-        ray.any(axis=2),
-        rest,
-        open_places,
-        np.zeros((120, 120)),
-        nothing,
-        empty,
-        empty,
-        0.01,
-        0.1,
-        1e-4,
-        0.0,
-    )
-    rng = np.random.default_rng(17)
-    label, partner = np.arange(120) % 6, rng.integers(-1, 6, 120)
-    partner[partner == label] = -1
-    fraction = np.where(partner < 0, 1.0, rng.uniform(0.5, 0.9, 120))
-    start = model_of_labels(label, evidence)
-    start = replace(start, partner=partner, fraction=fraction)
-    expected = start
-    for b in range(6):
-        expected = refit(expected, evidence, np.array([b]))
-    try:
-        for count in (1, None):
-            limit_threads(count)
-            found = refit(start, evidence, np.arange(6))
-            np.testing.assert_array_equal(found.rotations, expected.rotations)
-            np.testing.assert_array_equal(found.translations, expected.translations)
-    finally:
-        limit_threads(None)
 
 
 @pytest.mark.parametrize(("chosen", "used"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
