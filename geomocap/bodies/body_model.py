@@ -33,8 +33,6 @@ class Evidence:
         Standard deviation of the positions as their source states it; 0: not stated.
     ray : (N, T, 3) float, optional
         Directions along which positions are unsure, see `MotionPaths`.
-    lone : (N, T) bool
-        Where there are such directions: one camera alone sees the sample.
     rest : (N, 3) float, metres
         Positions in the reference.
     certain : (N,) bool
@@ -62,7 +60,6 @@ class Evidence:
     seen: np.ndarray
     sigma: np.ndarray
     ray: np.ndarray | None
-    lone: np.ndarray
     rest: np.ndarray
     certain: np.ndarray
     turns: np.ndarray
@@ -73,6 +70,11 @@ class Evidence:
     cap: float
     noise: float
     smoothness: float
+
+    @cached_property
+    def lone(self) -> np.ndarray:
+        """Where one camera alone sees a sample, (N, T) bool."""
+        return np.zeros(self.seen.shape, bool) if self.ray is None else (self.ray != 0).any(axis=2)
 
     @cached_property
     def counts(self) -> np.ndarray:

@@ -125,15 +125,13 @@ def _evidence(
     settings: MotionBodiesSettings,
 ) -> Evidence:
     near = csr_matrix(np.isfinite(graph.geodesics(max(settings.reach * diagonal, 3.0 * graph.spacing))).astype(float))
-    lone = np.zeros(paths.seen.shape, bool) if paths.ray is None else (paths.ray != 0).any(axis=2)
-    certain = paths.seen[:, 0] & ~lone[:, 0]
+    certain = paths.seen[:, 0] if paths.ray is None else paths.seen[:, 0] & ~paths.ray[:, 0].any(axis=1)
     return Evidence(
         positions,
         weights,
         paths.seen,
         paths.typical_sigma(),
         paths.ray,
-        lone,
         rest,
         certain,
         turns,

@@ -184,6 +184,7 @@ def pull_marks(A, b, sample, offset, position, precision, ray, x, R, binding, we
     places, turns = np.empty((count, 3)), np.empty((count, 3, 3))
     carry(sample, x, R, binding, weights, offsets, places, turns)
     error, pull = np.empty(3), np.eye(3)
+    # sums of three as `np.einsum` has them: the first and the third, then the second
     for k in range(count):
         s = sample[k]
         square, along = 0.0, 0.0

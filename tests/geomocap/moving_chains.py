@@ -86,3 +86,15 @@ def same_partition(found: np.ndarray, true: np.ndarray) -> float:
     np.add.at(table, (true, found), 1)
     best = table.argmax(axis=1)
     return float(sum(table[b, best[b]] for b in range(len(best)) if (best == best[b]).sum() == 1) / len(true))
+
+
+def loose_body(count: int, frames: int) -> tuple[np.ndarray, ...]:
+    """A moving body of which some samples go astray, some are not seen, and most have rays."""
+    rng = np.random.default_rng(13)
+    rest = rng.normal(scale=0.1, size=(count, 3)) + 1.0
+    true = Rotation.from_rotvec(rng.normal(scale=0.5, size=(frames, 3))).as_matrix()
+    positions = np.einsum("tij,nj->nti", true, rest) + rng.normal(scale=2e-3, size=(count, frames, 3))
+    positions[: count // 6] += rng.normal(scale=0.05, size=(count // 6, frames, 3))
+    weights = rng.random((count, frames)) * (rng.random((count, frames)) > 0.1)
+    ray = rng.normal(size=(count, frames, 3)) * (rng.random((count, frames, 1)) > 0.3)
+    return positions, rest, weights, ray / np.maximum(np.linalg.norm(ray, axis=2, keepdims=True), 1e-12)

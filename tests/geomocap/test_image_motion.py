@@ -18,7 +18,7 @@ from geomocap.nodes.image_pull import HALF, FrameImages, window_pulls
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.nodes.node_tracking import NodeModel, track_nodes
 from geomocap.nodes.surface_points import point_set
-from tests.geomocap.test_nodes_tracking import SMALL, bend, capsule
+from tests.geomocap.capsules import SMALL, bend, capsule
 
 RADIUS, DISTANCE, FOCAL, SIZE = 0.5, 3.0, 240.0, 120
 TURN_DEG = 4.0  # a frame

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from geomocap.model.motion_paths import DEPTH_FRACTION, MotionPaths, sure_part
 from geomocap.nodes.anchors import AnchorPoints, Anchors, carried, find_homes
 from geomocap.nodes.node_tracking import track_nodes
-from tests.geomocap.test_nodes_tracking import SMALL, capsule, small_graph
+from tests.geomocap.capsules import SMALL, capsule, small_graph
 
 # A round rod that turns about its axis looks the same all the time
 ANGLES = np.deg2rad(12.0) * np.arange(5)
