@@ -15,6 +15,7 @@ import numpy as np
 from geomocap.evaluation.body_scores import CORE_WEIGHT, adjusted_rand_index
 from geomocap.evaluation.skeletons import judge_skeleton
 from geomocap.evaluation.truth import Truth
+from geomocap.files.scan_geometry import ScanSurface, places_on
 from geomocap.motion import find_motion
 
 POINTS = 8000
@@ -28,23 +29,15 @@ HEADS = {
 }
 
 
-def surface_points(truth: Truth, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the surface in all frames, (N, T, 3) metres, and their weights for the true bodies, (N, B)."""
-    corners = truth.vertices[0][truth.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    face = truth.faces[rng.choice(len(truth.faces), POINTS, p=area / area.sum())]
-    place = rng.dirichlet(np.ones(3), POINTS)
-    weights = truth.body_weights
-    if weights is None:
-        weights = np.eye(len(truth.bodies))[truth.bodies.of_joint[truth.vertex_joint]]
-    tracks = np.einsum("nk,tnkc->ntc", place, truth.vertices[:, face])
-    return tracks, np.einsum("nk,nkb->nb", place, weights[face])
-
-
 def figures_of(truth: Truth, noise: float) -> dict[str, float]:
     """What is found from tracks with so much noise, metres, against the truth."""
+    places = places_on(ScanSurface(truth.vertices[0], truth.faces), POINTS, seed=1)
+    tracks = np.stack([places.of(vertices) for vertices in truth.vertices], axis=1)
+    of_vertices = truth.body_weights
+    if of_vertices is None:
+        of_vertices = np.eye(len(truth.bodies))[truth.bodies.of_joint[truth.vertex_joint]]
+    weights = places.of(of_vertices)
     rng = np.random.default_rng(1)
-    tracks, weights = surface_points(truth, rng)
     motion = find_motion(tracks + rng.normal(scale=noise, size=tracks.shape), fps=truth.fps)
     true, core = weights.argmax(axis=1), weights.max(axis=1) >= CORE_WEIGHT
     votes = np.zeros((len(truth.bodies), motion.body_count), int)
