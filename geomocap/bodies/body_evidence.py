@@ -11,6 +11,11 @@ they are two numbers and not three. c is the mean square by which bodies and ble
 that with it, where each may choose the place of the sample at rest: frame 0 is as noisy as any other, only motion is
 compared. s² is the noise that is everywhere on the surface, and e what soft skin between two bodies may differ from a
 blend of them: a fixed fraction of how far they carry it apart, but no more than the least turn of a body would move it.
+
+What touches a body and turns as it does may still move otherwise, if nothing joins the two: a cape on a back, an axe
+before a helmet. So to a turn comes how far the motions of both carry their best common point apart, as far as that is
+more than with the neighbour that the body hangs on: skin and folds of cloth slide a little against all of them. Where
+depths are unsure, it tells nothing.
 """
 
 from __future__ import annotations
@@ -44,6 +49,7 @@ _TIP_QUANTILE = 0.8
 # Turns of neighbourhoods that share most of their samples err together: those of samples far apart differ by noise
 # about so many times as much as those side by side. 2 merged soft joints of a man, 1.5 didn't; both mended a machine.
 _NOISE_FACTOR = 1.5
+_FAR = np.deg2rad(15.0)  # a joint off the border costs as much as if this turn moved it
 _UNEVEN = np.deg2rad(10.0)  # samples side by side that turn more differently are unsure
 
 
@@ -54,7 +60,7 @@ class Criterion:
     Attributes
     ----------
     min_turn : float, radians
-        It turns at least this much against each neighbour, beyond what noise feigns;
+        It turns at least this much against each neighbour, or slides as far, beyond what noise feigns;
     noise : SurfaceNoise
         blends of its neighbours miss its samples by more than this noise and its freedoms are worth;
     min_fraction : float
@@ -81,7 +87,7 @@ class Candidate:
     into : int
         Neighbour that turns most alike; -1: its samples go to blends of the neighbours.
     turn : float, radians
-        Least turn against a neighbour, without what noise feigns.
+        Least turn against a neighbour, with what it slides more than against another, without what noise feigns.
     evidence : float
         What it explains over what its freedoms cost.
     """
@@ -98,7 +104,8 @@ class Candidate:
         return 1.0 if np.isinf(self.strength) else self.strength / (1.0 + self.strength)
 
 
-Turns = dict[tuple[int, int], float]  # of two bodies, the lower number first, against each other, radians
+# Of two bodies, the lower number first, against each other: turn, radians, and slide, radii of the larger one
+Turns = dict[tuple[int, int], tuple[float, float]]
 
 
 def judge(
@@ -144,8 +151,10 @@ def _judge(
     inertia = max(samples, 1.0) * _square_radius(evidence.rest[members])
     feigned = _FEIGNED * max(criterion.noise.variance, own) / max(inertia, 1e-12)
     pairs = [(min(body, q), max(body, q)) for q in neighbours.tolist()]
-    known.update((pair, _turn(*pair, model, evidence)) for pair in pairs if pair not in known)
-    turns = [known[pair] for pair in pairs]
+    known.update((pair, _motion(*pair, model, evidence)) for pair in pairs if pair not in known)
+    motions = [known[pair] for pair in pairs]
+    joined = min(slide for _, slide in motions)  # as well as by the neighbour it hangs on
+    turns = [math.hypot(turn, math.sqrt(slide**2 - joined**2)) for turn, slide in motions]
     turn = float(np.sqrt(max(min(turns) ** 2 - feigned, 0.0)))
     by_turn, into = turn / criterion.min_turn, int(neighbours[int(np.argmin(turns))])
     size = float(evidence.counts[members].sum()) / max(criterion.min_fraction * len(model.label), 1e-12)
@@ -225,15 +234,39 @@ def _directions(members: np.ndarray, evidence: Evidence) -> float:
     return 3.0 - float((evidence.lone[members] & seen).sum() / max(seen.sum(), 1))
 
 
-def _turn(first: int, second: int, model: BodyModel, evidence: Evidence) -> float:
+def _motion(first: int, second: int, model: BodyModel, evidence: Evidence) -> tuple[float, float]:
+    """Turn and slide of two bodies against each other, in the frames that show both."""
+    known = _seen(first, model, evidence) & _seen(second, model, evidence)
+    if known.sum() < min(_LEAST_FRAMES, len(known)):
+        known[:] = True
+    return _turn(first, second, known, model, evidence), _slide(first, second, known, model, evidence)
+
+
+def _slide(first: int, second: int, known: np.ndarray, model: BodyModel, evidence: Evidence) -> float:
+    """What two bodies' motions carry their best common point near the border apart, in radii of the larger one.
+
+    What single cameras follow may stand off the surface, and slides then without being another body: there it is 0.
+    """
+    if evidence.ray is not None:
+        return 0.0
+    one, other = np.flatnonzero(model.label == first), np.flatnonzero(model.label == second)
+    rows, columns = evidence.adjacency[one][:, other].nonzero()
+    border = 0.5 * (evidence.rest[one[rows]].mean(axis=0) + evidence.rest[other[columns]].mean(axis=0))
+    turned = model.rotations[first, known] - model.rotations[second, known]
+    apart = turned @ border + model.translations[first, known] - model.translations[second, known]
+    normal = np.einsum("tji,tjk->ik", turned, turned) / len(turned) + _FAR**2 * np.eye(3)
+    moved = -np.linalg.solve(normal, np.einsum("tji,tj->i", turned, apart) / len(turned))
+    miss = ((turned @ moved + apart) ** 2).sum(axis=1).mean()
+    radius = max(_square_radius(evidence.rest[members]) for members in (one, other))
+    return float(np.sqrt(miss / max(radius, 1e-12)))
+
+
+def _turn(first: int, second: int, known: np.ndarray, model: BodyModel, evidence: Evidence) -> float:
     """Turn of two bodies against each other: mean of that of their motions and of their most different parts.
 
     What samples side by side turn differently is noise, which is taken from that of the parts; where it is so much that
     they are unsure, that of the motions counts more.
     """
-    known = _seen(first, model, evidence) & _seen(second, model, evidence)
-    if known.sum() < min(_LEAST_FRAMES, len(known)):
-        known[:] = True
     one, other = model.rotations[first, known], model.rotations[second, known]
     if min(evidence.seen[model.label == body, 0].sum() for body in (first, second)) < 3:
         # nothing ties the body to frame 0: its turn counts from the middle of the frames

@@ -25,7 +25,7 @@ class MotionBodiesSettings(Settings):
         default=15.0,
         gt=0,
         lt=180,
-        description="a body turns at least this much against each neighbour (degrees)",
+        description="a body turns at least this much against each neighbour, or slides as far over it (degrees)",
         json_schema_extra={"flag": "min-turn"},
     )
     part_turn_deg: float = Field(
