@@ -29,7 +29,8 @@ class MotionBodies:
     """B rigid bodies of N samples over T frames.
 
     A body is a part of the surface that turns, somewhere in the sequence, at least `min_turn_deg` against each
-    neighbour, or slides as far over those that it does not hang on, and explains more motion that these and blends of them do not than its freedoms cost.
+    neighbour, or slides as far over it, and explains more motion that these and blends of them do not than its freedoms
+    cost.
 
     Attributes
     ----------

@@ -165,7 +165,7 @@ def test_bodies_that_touch_and_turn_alike_are_two_if_nothing_joins_them():
     parts = [np.repeat(base[:, None], frames, axis=1)]
     for hinge in (-0.04, 0.04):  # two flaps side by side, each with a hinge of its own
         flap = block(250, (-0.03, 0.0, 0.0), (0.03, 0.3, 0.35))
-        parts.append(np.einsum("tij,nj->nti", swings, flap) + [hinge, 0.0, 0.0])
+        parts.append(np.einsum("tij,nj->nti", swings, flap) + np.array([hinge, 0.0, 0.0]))
     bodies = find_motion_bodies(MotionPaths(np.concatenate(parts)))
     assert bodies.body_count == 3
     assert same_partition(bodies.label, np.repeat([0, 1, 2], [400, 250, 250])) > 0.98
