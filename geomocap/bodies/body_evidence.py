@@ -10,7 +10,9 @@ n is the number of independent observations: neighbouring samples err together, 
 they are two numbers and not three. c is the mean square by which bodies and blends without this one miss a sample, o
 that with it, where each may choose the place of the sample at rest: frame 0 is as noisy as any other, only motion is
 compared. s² is the noise that is everywhere on the surface, and e what soft skin between two bodies may differ from a
-blend of them: a fixed fraction of how far they carry it apart, but no more than the least turn of a body would move it.
+blend of them: a fixed fraction of how far they turn it apart, but no more than the least turn of a body would move it.
+What turns it apart is a joint in its midst. Trunk and shank have none in a thigh: what their motions carry even their
+best common point apart is not counted, and the thigh is no soft skin of both.
 
 What touches a body and turns as it does may still move otherwise, if nothing joins the two: a cape on a back, an axe
 before a helmet. So to a turn comes how far the motions of both carry their best common point apart, as far as that is
@@ -49,7 +51,7 @@ _TIP_QUANTILE = 0.8
 # Turns of neighbourhoods that share most of their samples err together: those of samples far apart differ by noise
 # about so many times as much as those side by side. 2 merged soft joints of a man, 1.5 didn't; both mended a machine.
 _NOISE_FACTOR = 1.5
-_FAR = np.deg2rad(15.0)  # a joint off the border costs as much as if this turn moved it
+_FAR = np.deg2rad(15.0)  # a joint off the place where it is expected costs as much as if this turn moved it
 _UNEVEN = np.deg2rad(10.0)  # samples side by side that turn more differently are unsure
 
 
@@ -66,7 +68,7 @@ class Criterion:
     min_fraction : float
         of fewer samples than this fraction, it needs as much more evidence.
     softness : float
-        Soft skin differs from a blend of two bodies by up to this fraction of how far these carry it apart.
+        Soft skin differs from a blend of two bodies by up to this fraction of how far these turn it apart.
     """
 
     min_turn: float
@@ -196,7 +198,7 @@ def _explained(
         stated[evidence.lone[some].any(axis=1)] = 0.0
     noise = np.maximum(criterion.noise.variance, stated)
     if criterion.softness > 0:
-        apart = _spans(some, main, partner, model, evidence)
+        apart = _turned_apart(some, main, partner, model, evidence)
         # a swing of the least turn to and fro moves what lies around its middle by the mean square a² r² / 3
         soft = 4.0 * fraction * (1.0 - fraction) * criterion.softness**2 * apart
         noise += np.minimum(soft, criterion.min_turn**2 / 3.0 * _square_radius(evidence.rest[some]))
@@ -206,13 +208,22 @@ def _explained(
     return 0.5 * observations * float(gain.mean()), float(own.mean())
 
 
-def _spans(some: np.ndarray, main: np.ndarray, partner: np.ndarray, model: BodyModel, evidence: Evidence) -> np.ndarray:
-    """Mean square by which the two bodies of their blends carry samples apart, (n,), metres²; 0 without a second.
+def _turned_apart(
+    some: np.ndarray, main: np.ndarray, partner: np.ndarray, model: BodyModel, evidence: Evidence
+) -> np.ndarray:
+    """Mean square by which the two bodies of their blends turn samples apart, (n,), metres²; 0 without a second.
 
-    Frames are weighted as they are in what is missed of a sample: those in which it isn't seen don't count.
+    By as much as both motions carry even their best common point apart no joint between them does, and the samples are
+    no skin around one. Frames are weighted as they are in what is missed of a sample: those in which it isn't seen
+    don't count.
     """
     weights, rest = evidence.weights[some], evidence.rest[some]
-    return blend_spans(main, partner, weights, rest, model.rotations, model.translations)
+    apart = blend_spans(main, partner, weights, rest, model.rotations, model.translations)
+    middle = rest.mean(axis=0)
+    for one, other in np.unique(np.stack([main, partner])[:, partner >= 0], axis=1).T.tolist():
+        parted = _parting(one, other, middle, model, evidence).var(axis=0).sum()
+        apart[(main == one) & (partner == other)] -= parted
+    return np.maximum(apart, 0.0)
 
 
 def _square_radius(places: np.ndarray) -> float:
@@ -236,37 +247,43 @@ def _directions(members: np.ndarray, evidence: Evidence) -> float:
 
 def _motion(first: int, second: int, model: BodyModel, evidence: Evidence) -> tuple[float, float]:
     """Turn and slide of two bodies against each other, in the frames that show both."""
-    known = _seen(first, model, evidence) & _seen(second, model, evidence)
-    if known.sum() < min(_LEAST_FRAMES, len(known)):
-        known[:] = True
-    return _turn(first, second, known, model, evidence), _slide(first, second, known, model, evidence)
+    return _turn(first, second, model, evidence), _slide(first, second, model, evidence)
 
 
-def _slide(first: int, second: int, known: np.ndarray, model: BodyModel, evidence: Evidence) -> float:
-    """What two bodies' motions carry their best common point near the border apart, in radii of the larger one.
-
-    What single cameras follow may stand off the surface, and slides then without being another body: there it is 0.
-    """
-    if evidence.ray is not None:
-        return 0.0
+def _slide(first: int, second: int, model: BodyModel, evidence: Evidence) -> float:
+    """What two bodies' motions carry their best common point near the border apart, in radii of the larger one."""
     one, other = np.flatnonzero(model.label == first), np.flatnonzero(model.label == second)
     rows, columns = evidence.adjacency[one][:, other].nonzero()
     border = 0.5 * (evidence.rest[one[rows]].mean(axis=0) + evidence.rest[other[columns]].mean(axis=0))
-    turned = model.rotations[first, known] - model.rotations[second, known]
-    apart = turned @ border + model.translations[first, known] - model.translations[second, known]
-    normal = np.einsum("tji,tjk->ik", turned, turned) / len(turned) + _FAR**2 * np.eye(3)
-    moved = -np.linalg.solve(normal, np.einsum("tji,tj->i", turned, apart) / len(turned))
-    miss = ((turned @ moved + apart) ** 2).sum(axis=1).mean()
+    miss = (_parting(first, second, border, model, evidence) ** 2).sum(axis=1).mean()
     radius = max(_square_radius(evidence.rest[members]) for members in (one, other))
     return float(np.sqrt(miss / max(radius, 1e-12)))
 
 
-def _turn(first: int, second: int, known: np.ndarray, model: BodyModel, evidence: Evidence) -> float:
+def _parting(first: int, second: int, place: np.ndarray, model: BodyModel, evidence: Evidence) -> np.ndarray:
+    """How two bodies' motions carry their best common point near a place (3,) apart, (K, 3), metres.
+
+    In the frames that show both. What single cameras follow may stand off the surface, and slides then without being
+    another body: there it is 0.
+    """
+    known = _shown(first, second, model, evidence)
+    if evidence.ray is not None:
+        return np.zeros((int(known.sum()), 3))
+    turned = model.rotations[first, known] - model.rotations[second, known]
+    apart = turned @ place + model.translations[first, known] - model.translations[second, known]
+    normal = np.einsum("tji,tjk->ik", turned, turned) / len(turned) + _FAR**2 * np.eye(3)
+    moved = -np.linalg.solve(normal, np.einsum("tji,tj->i", turned, apart) / len(turned))
+    parting: np.ndarray = turned @ moved + apart
+    return parting
+
+
+def _turn(first: int, second: int, model: BodyModel, evidence: Evidence) -> float:
     """Turn of two bodies against each other: mean of that of their motions and of their most different parts.
 
     What samples side by side turn differently is noise, which is taken from that of the parts; where it is so much that
     they are unsure, that of the motions counts more.
     """
+    known = _shown(first, second, model, evidence)
     one, other = model.rotations[first, known], model.rotations[second, known]
     if min(evidence.seen[model.label == body, 0].sum() for body in (first, second)) < 3:
         # nothing ties the body to frame 0: its turn counts from the middle of the frames
@@ -284,6 +301,14 @@ def _turn(first: int, second: int, known: np.ndarray, model: BodyModel, evidence
     tips = float(np.sqrt(max(tips**2 - (_NOISE_FACTOR * uneven) ** 2, 0.0)))
     fraction = 0.5 * min(1.0, (_UNEVEN / max(float(uneven), 1e-9)) ** 2)
     return (1.0 - fraction) * turn + fraction * tips
+
+
+def _shown(first: int, second: int, model: BodyModel, evidence: Evidence) -> np.ndarray:
+    """Frames that show both of two bodies, (T,) bool; all where these are too few."""
+    known = _seen(first, model, evidence) & _seen(second, model, evidence)
+    if known.sum() < min(_LEAST_FRAMES, len(known)):
+        known[:] = True
+    return known
 
 
 def _seen(body: int, model: BodyModel, evidence: Evidence) -> np.ndarray:

@@ -58,7 +58,7 @@ class MotionBodiesSettings(Settings):
         ge=0,
         lt=1,
         description="soft skin between two bodies differs from a blend of them by up to this fraction of how far they "
-        "carry it apart (0..1); 0 where samples move with rigid parts",
+        "turn it apart about their common point (0..1); 0 where samples move with rigid parts",
     )
     neighbours: int = Field(default=10, ge=4, le=1000, description="neighbours of a sample on the surface")
     max_stretch: float = Field(

@@ -171,6 +171,31 @@ def test_bodies_that_touch_and_turn_alike_are_two_if_nothing_joins_them():
     assert same_partition(bodies.label, np.repeat([0, 1, 2], [400, 250, 250])) > 0.98
 
 
+@pytest.mark.parametrize(
+    ("turn_deg", "length", "width", "soft"),
+    [(20, 0.25, 0.06, 0.06), (25, 0.25, 0.06, 0.08), (25, 0.2, 0.1, 0.1), (30, 0.25, 0.06, 0.06)],
+)
+def test_a_thigh_is_no_soft_skin_of_trunk_and_shank(turn_deg, length, width, soft):
+    rng, frames = np.random.default_rng(0), 30
+
+    def block(samples: int, start: float, end: float, half: float) -> np.ndarray:
+        return rng.uniform((start, -half, -half), (end, half, half), (samples, 3))
+
+    thigh, shank = int(600 * length), 200
+    parts = [(400, -0.5, 0.0, 0.15), (thigh, 0.0, length, width / 2), (shank, length, length + 0.35, width / 2)]
+    rest = np.concatenate([block(*part) for part in parts])
+    angles = np.deg2rad(turn_deg) * np.sin(np.linspace(0, 2 * np.pi, frames))
+    swings = Rotation.from_rotvec(np.outer(angles, [0.0, 0.0, 1.0])).as_matrix()
+    by_thigh = np.einsum("tij,nj->nti", swings, rest)
+    knee = np.array([length, 0.0, 0.0])
+    by_shank = rest[:, None] + (swings @ knee - knee)  # it stays upright, as the trunk does
+    hip, down = (np.clip((rest[:, 0] - at + soft) / (2 * soft), 0.0, 1.0)[:, None, None] for at in (0.0, length))
+    positions = (1 - hip) * rest[:, None] + hip * ((1 - down) * by_thigh + down * by_shank)
+    bodies = find_motion_bodies(MotionPaths(positions))
+    assert bodies.body_count == 3
+    assert same_partition(bodies.label, np.repeat([0, 1, 2], [400, thigh, shank])) > 0.8
+
+
 @pytest.mark.parametrize("shared", [False, True])
 def test_more_noise_gives_no_more_bodies(three, shared):
     noise = np.random.default_rng(6).normal(size=three.positions.shape)
