@@ -51,7 +51,6 @@ _TIP_QUANTILE = 0.8
 # Turns of neighbourhoods that share most of their samples err together: those of samples far apart differ by noise
 # about so many times as much as those side by side. 2 merged soft joints of a man, 1.5 didn't; both mended a machine.
 _NOISE_FACTOR = 1.5
-_FAR = np.deg2rad(15.0)  # a joint off the place where it is expected costs as much as if this turn moved it
 _UNEVEN = np.deg2rad(10.0)  # samples side by side that turn more differently are unsure
 
 
@@ -153,7 +152,7 @@ def _judge(
     inertia = max(samples, 1.0) * _square_radius(evidence.rest[members])
     feigned = _FEIGNED * max(criterion.noise.variance, own) / max(inertia, 1e-12)
     pairs = [(min(body, q), max(body, q)) for q in neighbours.tolist()]
-    known.update((pair, _motion(*pair, model, evidence)) for pair in pairs if pair not in known)
+    known.update((pair, _motion(*pair, model, evidence, criterion)) for pair in pairs if pair not in known)
     motions = [known[pair] for pair in pairs]
     joined = min(slide for _, slide in motions)  # as well as by the neighbour it hangs on
     turns = [math.hypot(turn, math.sqrt(slide**2 - joined**2)) for turn, slide in motions]
@@ -198,7 +197,7 @@ def _explained(
         stated[evidence.lone[some].any(axis=1)] = 0.0
     noise = np.maximum(criterion.noise.variance, stated)
     if criterion.softness > 0:
-        apart = _turned_apart(some, main, partner, model, evidence)
+        apart = _turned_apart(some, main, partner, model, evidence, criterion)
         # a swing of the least turn to and fro moves what lies around its middle by the mean square a² r² / 3
         soft = 4.0 * fraction * (1.0 - fraction) * criterion.softness**2 * apart
         noise += np.minimum(soft, criterion.min_turn**2 / 3.0 * _square_radius(evidence.rest[some]))
@@ -209,7 +208,12 @@ def _explained(
 
 
 def _turned_apart(
-    some: np.ndarray, main: np.ndarray, partner: np.ndarray, model: BodyModel, evidence: Evidence
+    some: np.ndarray,
+    main: np.ndarray,
+    partner: np.ndarray,
+    model: BodyModel,
+    evidence: Evidence,
+    criterion: Criterion,
 ) -> np.ndarray:
     """Mean square by which the two bodies of their blends turn samples apart, (n,), metres²; 0 without a second.
 
@@ -221,7 +225,7 @@ def _turned_apart(
     apart = blend_spans(main, partner, weights, rest, model.rotations, model.translations)
     middle = rest.mean(axis=0)
     for one, other in np.unique(np.stack([main, partner])[:, partner >= 0], axis=1).T.tolist():
-        parted = _parting(one, other, middle, model, evidence).var(axis=0).sum()
+        parted = _parting(one, other, middle, model, evidence, criterion).var(axis=0).sum()
         apart[(main == one) & (partner == other)] -= parted
     return np.maximum(apart, 0.0)
 
@@ -245,33 +249,35 @@ def _directions(members: np.ndarray, evidence: Evidence) -> float:
     return 3.0 - float((evidence.lone[members] & seen).sum() / max(seen.sum(), 1))
 
 
-def _motion(first: int, second: int, model: BodyModel, evidence: Evidence) -> tuple[float, float]:
+def _motion(first: int, second: int, model: BodyModel, evidence: Evidence, criterion: Criterion) -> tuple[float, float]:
     """Turn and slide of two bodies against each other, in the frames that show both."""
-    return _turn(first, second, model, evidence), _slide(first, second, model, evidence)
+    return _turn(first, second, model, evidence), _slide(first, second, model, evidence, criterion)
 
 
-def _slide(first: int, second: int, model: BodyModel, evidence: Evidence) -> float:
+def _slide(first: int, second: int, model: BodyModel, evidence: Evidence, criterion: Criterion) -> float:
     """What two bodies' motions carry their best common point near the border apart, in radii of the larger one."""
     one, other = np.flatnonzero(model.label == first), np.flatnonzero(model.label == second)
     rows, columns = evidence.adjacency[one][:, other].nonzero()
     border = 0.5 * (evidence.rest[one[rows]].mean(axis=0) + evidence.rest[other[columns]].mean(axis=0))
-    miss = (_parting(first, second, border, model, evidence) ** 2).sum(axis=1).mean()
+    miss = (_parting(first, second, border, model, evidence, criterion) ** 2).sum(axis=1).mean()
     radius = max(_square_radius(evidence.rest[members]) for members in (one, other))
     return float(np.sqrt(miss / max(radius, 1e-12)))
 
 
-def _parting(first: int, second: int, place: np.ndarray, model: BodyModel, evidence: Evidence) -> np.ndarray:
+def _parting(
+    first: int, second: int, place: np.ndarray, model: BodyModel, evidence: Evidence, criterion: Criterion
+) -> np.ndarray:
     """How two bodies' motions carry their best common point near a place (3,) apart, (K, 3), metres.
 
-    In the frames that show both. What single cameras follow may stand off the surface, and slides then without being
-    another body: there it is 0.
+    In the frames that show both. A point off the place costs as much as if the least turn of a body moved it. What
+    single cameras follow may stand off the surface, and slides then without being another body: there it is 0.
     """
     known = _shown(first, second, model, evidence)
     if evidence.ray is not None:
         return np.zeros((int(known.sum()), 3))
     turned = model.rotations[first, known] - model.rotations[second, known]
     apart = turned @ place + model.translations[first, known] - model.translations[second, known]
-    normal = np.einsum("tji,tjk->ik", turned, turned) / len(turned) + _FAR**2 * np.eye(3)
+    normal = np.einsum("tji,tjk->ik", turned, turned) / len(turned) + criterion.min_turn**2 * np.eye(3)
     moved = -np.linalg.solve(normal, np.einsum("tji,tj->i", turned, apart) / len(turned))
     parting: np.ndarray = turned @ moved + apart
     return parting

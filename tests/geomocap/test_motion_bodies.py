@@ -117,85 +117,6 @@ def test_bodies_that_turn_less_are_one():
     assert find_motion_bodies(MotionPaths(small.positions)).body_count == 1
 
 
-def test_soft_skin_is_no_body_of_its_own():
-    two = chain(2, samples=250, turn_deg=45.0)
-    weight = np.clip((two.positions[:, 0, 0] - 0.25) / 0.3, 0.0, 1.0)  # 0.3 m of skin between the two
-    rest = two.positions[:, 0]
-    first = np.einsum("tij,nj->nti", two.rotations[:, 0], rest) + two.translations[:, 0]
-    second = np.einsum("tij,nj->nti", two.rotations[:, 1], rest) + two.translations[:, 1]
-    paths = MotionPaths((1 - weight)[:, None, None] * first + weight[:, None, None] * second)
-    bodies = find_motion_bodies(paths)
-    assert bodies.body_count == 2
-    rigid = (weight == 0) | (weight == 1)
-    assert same_partition(bodies.label[rigid], (weight[rigid] > 0.5).astype(int)) == 1.0
-    of_second = bodies.weights[:, bodies.label[np.argmax(rest[:, 0])]]
-    assert np.abs(of_second - weight)[~rigid].mean() < 0.12  # even blends are penalised
-    alone = find_motion_bodies(paths, MotionBodiesSettings(blends=False))
-    assert np.isin(alone.weights, [0.0, 1.0]).all()
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_deep_soft_skin_between_three_bodies_is_no_fourth(seed):
-    three = chain(3, samples=200, turn_deg=70.0, seed=seed)
-    rest = three.positions[:, 0]
-    up, down = (np.clip((rest[:, 0] - joint + 0.25) / 0.5, 0.0, 1.0) for joint in (0.4, 0.8))
-    up, down = (fraction**2 * (3.0 - 2.0 * fraction) for fraction in (up, down))
-    weights = np.stack([1 - up, up * (1 - down), up * down], axis=1)
-    weights /= weights.sum(axis=1, keepdims=True)
-    carried = np.einsum("tbij,nj->nbti", three.rotations, rest) + three.translations.swapaxes(0, 1)[None]
-    paths = MotionPaths(np.einsum("nb,nbti->nti", weights, carried))
-    assert find_motion_bodies(paths, MotionBodiesSettings(soft_fraction=0.0)).body_count > 3
-    pieces = np.digitize(rest[:, 0], np.linspace(0.0, 1.2, 10)[1:-1])  # rigid parts are no skin
-    assert find_motion_bodies(replace(paths, parts=pieces)).body_count > 3
-    bodies = find_motion_bodies(paths)
-    assert bodies.body_count == 3
-    core = weights.max(axis=1) > 0.8
-    assert same_partition(bodies.label[core], weights[core].argmax(axis=1)) > 0.97
-
-
-def test_bodies_that_touch_and_turn_alike_are_two_if_nothing_joins_them():
-    rng, frames = np.random.default_rng(0), 30
-
-    def block(samples: int, low: tuple[float, float, float], high: tuple[float, float, float]) -> np.ndarray:
-        return rng.uniform(low, high, (samples, 3))
-
-    base = block(400, (-0.4, 0.0, -0.06), (0.4, 0.3, 0.0))
-    turns = np.deg2rad(35.0) * np.sin(np.linspace(0.0, 2 * np.pi, frames))
-    swings = Rotation.from_rotvec(np.outer(turns, [0.0, 1.0, 0.0])).as_matrix()
-    parts = [np.repeat(base[:, None], frames, axis=1)]
-    for hinge in (-0.04, 0.04):  # two flaps side by side, each with a hinge of its own
-        flap = block(250, (-0.03, 0.0, 0.0), (0.03, 0.3, 0.35))
-        parts.append(np.einsum("tij,nj->nti", swings, flap) + np.array([hinge, 0.0, 0.0]))
-    bodies = find_motion_bodies(MotionPaths(np.concatenate(parts)))
-    assert bodies.body_count == 3
-    assert same_partition(bodies.label, np.repeat([0, 1, 2], [400, 250, 250])) > 0.98
-
-
-@pytest.mark.parametrize(
-    ("turn_deg", "length", "width", "soft"),
-    [(20, 0.25, 0.06, 0.06), (25, 0.25, 0.06, 0.08), (25, 0.2, 0.1, 0.1), (30, 0.25, 0.06, 0.06)],
-)
-def test_a_thigh_is_no_soft_skin_of_trunk_and_shank(turn_deg, length, width, soft):
-    rng, frames = np.random.default_rng(0), 30
-
-    def block(samples: int, start: float, end: float, half: float) -> np.ndarray:
-        return rng.uniform((start, -half, -half), (end, half, half), (samples, 3))
-
-    thigh, shank = int(600 * length), 200
-    parts = [(400, -0.5, 0.0, 0.15), (thigh, 0.0, length, width / 2), (shank, length, length + 0.35, width / 2)]
-    rest = np.concatenate([block(*part) for part in parts])
-    angles = np.deg2rad(turn_deg) * np.sin(np.linspace(0, 2 * np.pi, frames))
-    swings = Rotation.from_rotvec(np.outer(angles, [0.0, 0.0, 1.0])).as_matrix()
-    by_thigh = np.einsum("tij,nj->nti", swings, rest)
-    knee = np.array([length, 0.0, 0.0])
-    by_shank = rest[:, None] + (swings @ knee - knee)  # it stays upright, as the trunk does
-    hip, down = (np.clip((rest[:, 0] - at + soft) / (2 * soft), 0.0, 1.0)[:, None, None] for at in (0.0, length))
-    positions = (1 - hip) * rest[:, None] + hip * ((1 - down) * by_thigh + down * by_shank)
-    bodies = find_motion_bodies(MotionPaths(positions))
-    assert bodies.body_count == 3
-    assert same_partition(bodies.label, np.repeat([0, 1, 2], [400, thigh, shank])) > 0.8
-
-
 @pytest.mark.parametrize("shared", [False, True])
 def test_more_noise_gives_no_more_bodies(three, shared):
     noise = np.random.default_rng(6).normal(size=three.positions.shape)
@@ -210,22 +131,6 @@ def test_more_noise_gives_no_more_bodies(three, shared):
         assert bodies.noise > 0.3 * size
     assert counts[0] == 3
     assert max(counts) == 3
-
-
-@pytest.mark.parametrize("wave", [(60.0, 40.0, 0.5), (40.0, 60.0, 0.5), (30.0, 30.0, 0.5), (50.0, -40.0, 0.4)])
-def test_folds_of_cloth_are_no_bodies(three, wave):
-    rest = three.positions[:, 0]
-    phase = wave[0] * rest[:, 0, None] + wave[1] * rest[:, 1, None] + wave[2] * np.arange(24)
-    counts = []
-    for height in (0.006, 0.008, 0.009, 0.010, 0.011):  # metres; they turn the cloth by up to 45 degrees to and fro
-        folds = height * np.sin(phase)[..., None] * np.array([0.2, 0.6, 0.8])  # waves that run over the middle box
-        bodies = find_motion_bodies(MotionPaths(three.positions + (three.body == 1)[:, None, None] * folds))
-        counts.append(bodies.body_count)
-        if bodies.body_count == 3:
-            assert same_partition(bodies.label, three.body) > 0.9
-    # which groups come first is luck: one height or another leaves a fold
-    assert np.median(counts) == 3
-    assert max(counts) <= 4
 
 
 def test_misses_of_rings_are_those_of_numpy(three):
