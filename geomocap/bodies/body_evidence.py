@@ -14,6 +14,14 @@ blend of them: a fixed fraction of how far they turn it apart, but no more than 
 What turns it apart is a joint in its midst. Trunk and shank have none in a thigh: what their motions carry even their
 best common point apart is not counted, and the thigh is no soft skin of both.
 
+Nor do joints come free. Without the thigh, trunk and shank would have to meet in a joint, or the shank has as many
+freedoms more as the thigh has. So to what a body explains of its samples comes what it adds to the likelihood of the
+joints: they part by a mean square p with it and by q without, and of each that it makes needless
+
+    3/2 log[(s² + q) / (s² + p)]
+
+is added. Which bodies meet is the tree that parts least, among its neighbours with it and without it.
+
 What touches a body and turns as it does may still move otherwise, if nothing joins the two: a cape on a back, an axe
 before a helmet. So to a turn comes how far the motions of both carry their best common point apart, as far as that is
 more than with the neighbour that the body hangs on: skin and folds of cloth slide a little against all of them. Where
@@ -27,8 +35,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import minimum_spanning_tree
 
 from geomocap.bodies.body_model import BodyModel, Evidence
 from geomocap.bodies.rigid_motions import relative_turn
@@ -36,7 +43,9 @@ from geomocap.bodies.skin_blending import blend_spans
 from geomocap.bodies.surface_noise import SurfaceNoise
 
 _FREEDOMS = 3  # of a turn
+_OF_A_JOINT = 3  # directions in which it holds two bodies together
 _FITTED = 6  # freedoms that were fitted to a body's own samples
+_NO_EDGE = 1e-9  # what a joint costs at least: 0 would be no edge of the tree
 _MOST_SAMPLES = 80
 _MOST_NEIGHBOURS = 7
 _LEAST_CONTACTS = 3
@@ -105,6 +114,35 @@ class Candidate:
         return 1.0 if np.isinf(self.strength) else self.strength / (1.0 + self.strength)
 
 
+@dataclass(frozen=True)
+class Borders:
+    """Where bodies touch.
+
+    Attributes
+    ----------
+    contacts : (B, B) int
+        Neighbouring pairs of samples of each two bodies.
+    places : (B, B, 3) float, metres
+        Middle of these; 0 without.
+    """
+
+    contacts: np.ndarray
+    places: np.ndarray
+
+    @classmethod
+    def of(cls, model: BodyModel, evidence: Evidence) -> Borders:
+        """Find where the bodies of a model touch."""
+        rows, columns = evidence.adjacency.nonzero()
+        one, other = model.label[rows], model.label[columns]
+        apart, square = one != other, (model.count, model.count)
+        pair = np.ravel_multi_index((one[apart], other[apart]), square)
+        middle = 0.5 * (evidence.rest[rows[apart]] + evidence.rest[columns[apart]])
+        contacts = np.bincount(pair, minlength=model.count**2)
+        sums = [np.bincount(pair, middle[:, c], model.count**2) for c in range(3)]
+        places = np.stack(sums, axis=1) / np.maximum(contacts, 1)[:, None]
+        return cls(contacts.reshape(square), places.reshape(*square, 3))
+
+
 # Of two bodies, the lower number first, against each other: turn, radians, and slide, radii of the larger one
 Turns = dict[tuple[int, int], tuple[float, float]]
 
@@ -115,8 +153,7 @@ def judge(
     """What speaks for some bodies, by their number.
 
     The evidence of a body of few samples must be greater by as much as it is too small: limbs are often followed by
-    few, and noise is no limb. Where single cameras follow the surface it goes, unless others hang together by it alone,
-    as foot and trunk do by a leg that few samples are on.
+    few, and noise is no limb.
 
     Parameters
     ----------
@@ -127,15 +164,16 @@ def judge(
     turns : dict, optional
         Turns that are known already; what is found is added.
     """
-    contacts, turns = model.contacts(evidence.adjacency), {} if turns is None else turns
+    borders, turns = Borders.of(model, evidence), {} if turns is None else turns
     seen_alone = np.ascontiguousarray(np.where(evidence.seen, evidence.weights, 0.0))  # gaps are filled by guesses
     evidence = replace(evidence, weights=seen_alone)
-    return {b: _judge(b, model, evidence, criterion, contacts, turns) for b in bodies}
+    return {b: _judge(b, model, evidence, criterion, borders, turns) for b in bodies}
 
 
 def _judge(
-    body: int, model: BodyModel, evidence: Evidence, criterion: Criterion, contacts: np.ndarray, known: Turns
+    body: int, model: BodyModel, evidence: Evidence, criterion: Criterion, borders: Borders, known: Turns
 ) -> Candidate:
+    contacts = borders.contacts
     members, touching = np.flatnonzero(model.label == body), contacts[body]
     if not len(members) or not touching.any():
         return Candidate(body, np.inf, -1, np.inf, np.inf)
@@ -147,12 +185,13 @@ def _judge(
     samples = criterion.noise.independent(evidence.rest[some], len(members)) * _coverage(evidence.seen[members])
     observations = _directions(members, evidence) * samples
     nats, own = _explained(body, neighbours, some, observations, model, evidence, criterion)
+    nats += held_together(body, neighbours, model, evidence, criterion, borders)
     by_evidence = nats / (0.5 * _FREEDOMS * np.log(max(observations, math.e)))
     # what noise feigns is no turn
     inertia = max(samples, 1.0) * _square_radius(evidence.rest[members])
     feigned = _FEIGNED * max(criterion.noise.variance, own) / max(inertia, 1e-12)
     pairs = [(min(body, q), max(body, q)) for q in neighbours.tolist()]
-    known.update((pair, _motion(*pair, model, evidence, criterion)) for pair in pairs if pair not in known)
+    known.update((pair, _motion(*pair, model, evidence, criterion, borders)) for pair in pairs if pair not in known)
     motions = [known[pair] for pair in pairs]
     joined = min(slide for _, slide in motions)  # as well as by the neighbour it hangs on
     turns = [math.hypot(turn, math.sqrt(slide**2 - joined**2)) for turn, slide in motions]
@@ -160,10 +199,6 @@ def _judge(
     by_turn, into = turn / criterion.min_turn, int(neighbours[int(np.argmin(turns))])
     size = float(evidence.counts[members].sum()) / max(criterion.min_fraction * len(model.label), 1e-12)
     by_evidence *= min(size, 1.0)
-    # what single cameras follow may stand off the surface: with the rule above alone a real recording before four
-    # cameras had 16 bodies instead of 13, and joints that were 13 mm worse
-    if evidence.ray is not None and size < 1.0 and not _connects(body, neighbours, contacts):
-        return Candidate(body, min(0.5 * size, by_evidence, by_turn), into, turn, by_evidence)
     return Candidate(body, min(by_evidence, by_turn), into if by_turn < by_evidence else -1, turn, by_evidence)
 
 
@@ -223,6 +258,8 @@ def _turned_apart(
     """
     weights, rest = evidence.weights[some], evidence.rest[some]
     apart = blend_spans(main, partner, weights, rest, model.rotations, model.translations)
+    if evidence.ray is not None:
+        return apart
     middle = rest.mean(axis=0)
     for one, other in np.unique(np.stack([main, partner])[:, partner >= 0], axis=1).T.tolist():
         parted = _parting(one, other, middle, model, evidence, criterion).var(axis=0).sum()
@@ -249,19 +286,49 @@ def _directions(members: np.ndarray, evidence: Evidence) -> float:
     return 3.0 - float((evidence.lone[members] & seen).sum() / max(seen.sum(), 1))
 
 
-def _motion(first: int, second: int, model: BodyModel, evidence: Evidence, criterion: Criterion) -> tuple[float, float]:
-    """Turn and slide of two bodies against each other, in the frames that show both."""
-    return _turn(first, second, model, evidence), _slide(first, second, model, evidence, criterion)
+def _motion(
+    first: int, second: int, model: BodyModel, evidence: Evidence, criterion: Criterion, borders: Borders
+) -> tuple[float, float]:
+    """Turn and slide of two bodies against each other, in the frames that show both.
+
+    They slide by what their motions carry their best common point near the border apart, in radii of the larger one.
+    Where single cameras follow the surface it may stand off, and slides then without being another body: there it is 0.
+    """
+    turn = _turn(first, second, model, evidence)
+    if evidence.ray is not None:
+        return turn, 0.0
+    miss = _parted(first, second, borders.places[first, second], model, evidence, criterion)
+    radius = max(_square_radius(evidence.rest[model.label == body]) for body in (first, second))
+    return turn, float(np.sqrt(miss / max(radius, 1e-12)))
 
 
-def _slide(first: int, second: int, model: BodyModel, evidence: Evidence, criterion: Criterion) -> float:
-    """What two bodies' motions carry their best common point near the border apart, in radii of the larger one."""
-    one, other = np.flatnonzero(model.label == first), np.flatnonzero(model.label == second)
-    rows, columns = evidence.adjacency[one][:, other].nonzero()
-    border = 0.5 * (evidence.rest[one[rows]].mean(axis=0) + evidence.rest[other[columns]].mean(axis=0))
-    miss = (_parting(first, second, border, model, evidence, criterion) ** 2).sum(axis=1).mean()
-    radius = max(_square_radius(evidence.rest[members]) for members in (one, other))
-    return float(np.sqrt(miss / max(radius, 1e-12)))
+def held_together(
+    body: int, neighbours: np.ndarray, model: BodyModel, evidence: Evidence, criterion: Criterion, borders: Borders
+) -> float:
+    """Log likelihood that a body adds to that of the joints of its neighbours, in nats: 0 with one neighbour.
+
+    Joints are those of the tree that parts least. Without the body its neighbours meet where they touch each other, or
+    where they touched the body, which hangs on one of them.
+    """
+    joined = [body, *neighbours.tolist()]
+    costs = np.zeros((len(joined), len(joined)))
+    for i in range(1, len(joined)):
+        for k in range(i):
+            pair = joined[i], joined[k]
+            places = [borders.places[pair]] if borders.contacts[pair] else []
+            if k > 0:
+                places += [borders.places[body, one] for one in pair]
+            miss = min(_parted(*pair, place, model, evidence, criterion) for place in places)
+            costs[i, k] = math.log1p(miss / criterion.noise.variance) + _NO_EDGE
+    alone, together = (minimum_spanning_tree(some).sum() for some in (costs[1:, 1:], costs))
+    return 0.5 * _OF_A_JOINT * float(alone + costs[1:, 0].min() - together)
+
+
+def _parted(
+    first: int, second: int, place: np.ndarray, model: BodyModel, evidence: Evidence, criterion: Criterion
+) -> float:
+    """Mean square by which two bodies' motions carry their best common point near a place (3,) apart, metres²."""
+    return float((_parting(first, second, place, model, evidence, criterion) ** 2).sum(axis=1).mean())
 
 
 def _parting(
@@ -269,12 +336,9 @@ def _parting(
 ) -> np.ndarray:
     """How two bodies' motions carry their best common point near a place (3,) apart, (K, 3), metres.
 
-    In the frames that show both. A point off the place costs as much as if the least turn of a body moved it. What
-    single cameras follow may stand off the surface, and slides then without being another body: there it is 0.
+    In the frames that show both. A point off the place costs as much as if the least turn of a body moved it.
     """
     known = _shown(first, second, model, evidence)
-    if evidence.ray is not None:
-        return np.zeros((int(known.sum()), 3))
     turned = model.rotations[first, known] - model.rotations[second, known]
     apart = turned @ place + model.translations[first, known] - model.translations[second, known]
     normal = np.einsum("tji,tjk->ik", turned, turned) / len(turned) + criterion.min_turn**2 * np.eye(3)
@@ -321,11 +385,3 @@ def _seen(body: int, model: BodyModel, evidence: Evidence) -> np.ndarray:
     """Frames in which enough samples of a body are seen to know its motion, (T,) bool."""
     seen = evidence.seen[model.label == body]
     return seen.sum(axis=0) >= max(_LEAST_SAMPLES, _LEAST_SEEN * len(seen))
-
-
-def _connects(body: int, neighbours: np.ndarray, contacts: np.ndarray) -> bool:
-    """Whether the bodies beside it hang together by this one only."""
-    touching = contacts >= _LEAST_CONTACTS
-    touching[body] = touching[:, body] = False
-    part = connected_components(csr_matrix(touching), directed=False)[1]
-    return len(np.unique(part[neighbours])) > 1

@@ -49,8 +49,7 @@ class MotionBodiesSettings(Settings):
         ge=0,
         lt=0.5,
         description="bodies of fewer samples need as much more evidence (fraction of the samples; what one camera "
-        "alone sees counts two thirds); where single cameras follow the surface they go, unless two others hang "
-        "together by them",
+        "alone sees counts two thirds)",
         json_schema_extra={"flag": "min-fraction"},
     )
     soft_fraction: float = Field(

@@ -97,6 +97,24 @@ def test_a_thigh_is_no_soft_skin_of_trunk_and_shank(turn_deg, length, width, sof
     assert same_partition(bodies.label[stiff], np.repeat([0, 1, 2], [400, thigh, shank])[stiff]) > 0.97
 
 
+@pytest.mark.parametrize(("turn_deg", "noise"), [(25, 0.005), (25, 0.01), (40, 0.01)])
+def test_a_thin_limb_between_two_bodies_is_one_for_it_joins_them(turn_deg, noise):
+    rng, frames = np.random.default_rng(0), 30
+    parts = [(400, -0.5, 0.0, 0.15), (100, 0.0, 0.3, 0.015), (120, 0.3, 0.65, 0.04)]
+    rest = np.concatenate([rng.uniform((start, -h, -h), (end, h, h), (n, 3)) for n, start, end, h in parts])
+    body = np.repeat([0, 1, 2], [part[0] for part in parts])
+    angles = np.deg2rad(turn_deg) * np.sin(np.linspace(0, 2 * np.pi, frames))
+    swings = Rotation.from_rotvec(np.outer(angles, [0.0, 0.0, 1.0])).as_matrix()
+    knee = np.array([0.3, 0.0, 0.0])
+    carried = [np.repeat(rest[:, None], frames, axis=1), np.einsum("tij,nj->nti", swings, rest)]
+    carried.append(rest[:, None] + (swings @ knee - knee))  # it stays upright, as the first does
+    positions = np.stack(carried)[body, np.arange(len(body))]
+    # blends of what it joins, which turn alike, explain an axis between them wholly
+    bodies = find_motion_bodies(MotionPaths(positions + noise * rng.normal(size=positions.shape)))
+    assert bodies.body_count == 3
+    assert same_partition(bodies.label, body) > 0.9
+
+
 @pytest.mark.parametrize("wave", [(60.0, 40.0, 0.5), (40.0, 60.0, 0.5), (30.0, 30.0, 0.5), (50.0, -40.0, 0.4)])
 def test_folds_of_cloth_are_no_bodies(three, wave):
     rest = three.positions[:, 0]

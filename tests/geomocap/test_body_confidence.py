@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from geomocap.bodies.body_evidence import Criterion, judge
+from geomocap.bodies.body_evidence import Borders, Criterion, held_together, judge
 from geomocap.bodies.body_model import model_of_labels
 from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.bodies.first_bodies import first_bodies
@@ -52,13 +52,34 @@ def test_a_small_body_needs_more_evidence(three):
     assert find_motion_bodies(noisy, small).body_count == 2
 
 
-def test_a_small_body_that_single_cameras_see_goes(three):
-    kept = (three.body != 2) | (np.arange(len(three.body)) % 2 == 0)
-    positions, small = three.positions[kept], MotionBodiesSettings(min_fraction=0.16)  # the last has 1/5 of them
+def test_a_small_body_that_single_cameras_see_needs_more_evidence_too(three):
+    kept = (three.body != 2) | (np.arange(len(three.body)) % 2 == 0)  # the last has 1/5 of them, each counts two thirds
+    positions, small = three.positions[kept], MotionBodiesSettings(min_fraction=0.24)
     ray = seen_by_single_cameras(three, 0.0)[1][kept]
-    assert find_motion_bodies(MotionPaths(positions), small).body_count == 3
-    assert find_motion_bodies(MotionPaths(positions, ray=ray), small).body_count == 2  # each counts two thirds
-    assert find_motion_bodies(MotionPaths(positions, ray=ray), MotionBodiesSettings()).body_count == 3
+    assert find_motion_bodies(MotionPaths(positions, ray=ray), small).body_count == 3
+    noisy = MotionPaths(positions + 0.018 * np.random.default_rng(0).normal(size=positions.shape), ray=ray)
+    assert find_motion_bodies(noisy).body_count == 3
+    assert find_motion_bodies(noisy, small).body_count == 2
+
+
+def test_a_body_adds_to_the_joints_of_those_it_joins(three):
+    paths, settings = MotionPaths(three.positions), MotionBodiesSettings()
+    first = first_bodies(*complete_tracks(paths), paths, settings)
+    model = model_of_labels(three.body, first.evidence)
+    borders = Borders.of(model, first.evidence)
+    assert (borders.contacts > 0).tolist() == [[False, True, False], [True, False, True], [False, True, False]]
+    np.testing.assert_allclose(borders.places[1, 2], borders.places[2, 1])
+    assert abs(borders.places[0, 1, 0] - three.joints[0, 0]) < 0.03
+    criterion = Criterion(settings.least_turn(rigid=False), first.noise, settings.min_fraction, settings.soft_fraction)
+    for body, neighbours in ((0, [1]), (2, [1])):
+        assert held_together(body, np.array(neighbours), model, first.evidence, criterion, borders) == 0
+    # without the middle one the outer two would have to meet, which they do nowhere
+    assert held_together(1, np.array([0, 2]), model, first.evidence, criterion, borders) > 3
+    # two halves of one body join nothing that the other half doesn't
+    halves = np.where((three.body == 1) & (np.arange(len(three.body)) % 2 == 0), 3, three.body)
+    model = model_of_labels(halves, first.evidence)
+    borders = Borders.of(model, first.evidence)
+    assert held_together(3, np.array([0, 1, 2]), model, first.evidence, criterion, borders) < 0.5
 
 
 def test_few_samples_that_hardly_touch_others_are_no_body(three):
