@@ -191,7 +191,7 @@ def explain(
         weights,
         ray,
         np.ascontiguousarray(rest),
-        certain,
+        np.ascontiguousarray(certain),
         rotations,
         translations,
         allowed,
