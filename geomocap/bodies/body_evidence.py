@@ -123,7 +123,7 @@ class Borders:
     contacts : (B, B) int
         Neighbouring pairs of samples of each two bodies.
     places : (B, B, 3) float, metres
-        Middle of these; 0 without.
+        Middle of these, of different bodies; without meaning where they don't touch.
     """
 
     contacts: np.ndarray
@@ -132,15 +132,12 @@ class Borders:
     @classmethod
     def of(cls, model: BodyModel, evidence: Evidence) -> Borders:
         """Find where the bodies of a model touch."""
+        contacts = model.contacts(evidence.adjacency)
         rows, columns = evidence.adjacency.nonzero()
-        one, other = model.label[rows], model.label[columns]
-        apart, square = one != other, (model.count, model.count)
-        pair = np.ravel_multi_index((one[apart], other[apart]), square)
-        middle = 0.5 * (evidence.rest[rows[apart]] + evidence.rest[columns[apart]])
-        contacts = np.bincount(pair, minlength=model.count**2)
-        sums = [np.bincount(pair, middle[:, c], model.count**2) for c in range(3)]
-        places = np.stack(sums, axis=1) / np.maximum(contacts, 1)[:, None]
-        return cls(contacts.reshape(square), places.reshape(*square, 3))
+        pair = model.count * model.label[rows] + model.label[columns]
+        middle = 0.5 * (evidence.rest[rows] + evidence.rest[columns])
+        sums = np.stack([np.bincount(pair, along, model.count**2) for along in middle.T], axis=1)
+        return cls(contacts, sums.reshape(*contacts.shape, 3) / np.maximum(contacts, 1)[..., None])
 
 
 # Of two bodies, the lower number first, against each other: turn, radians, and slide, radii of the larger one
@@ -254,7 +251,7 @@ def _turned_apart(
 
     By as much as both motions carry even their best common point apart no joint between them does, and the samples are
     no skin around one. Frames are weighted as they are in what is missed of a sample: those in which it isn't seen
-    don't count.
+    don't count. Where single cameras follow the surface it may stand off, and nothing is taken to part.
     """
     weights, rest = evidence.weights[some], evidence.rest[some]
     apart = blend_spans(main, partner, weights, rest, model.rotations, model.translations)

@@ -143,8 +143,8 @@ class BodyModel:
     def contacts(self, adjacency: csr_matrix) -> np.ndarray:
         """Neighbouring pairs of samples between each two bodies, (B, B) int; the diagonal is 0."""
         rows, columns = adjacency.nonzero()
-        result = np.zeros((self.count, self.count), int)
-        np.add.at(result, (self.label[rows], self.label[columns]), 1)
+        pair = self.count * self.label[rows] + self.label[columns]
+        result = np.bincount(pair, minlength=self.count**2).reshape(self.count, self.count)
         np.fill_diagonal(result, 0)
         return result
 
