@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geomocap.bodies.body_evidence import Candidate, Criterion, Turns, judge
+from geomocap.bodies.body_evidence import Candidate, Criterion, Turns, judge, neighbours_of
 from geomocap.bodies.body_model import BodyModel, Evidence, reassign, refit, settle_rest
 
 _FURTHER = 4  # steps beyond the criterion, as alternatives
@@ -128,7 +128,7 @@ def remove(candidate: Candidate, model: BodyModel, evidence: Evidence) -> tuple[
         affected = np.array([candidate.into])
     else:
         reached = np.bincount(model.label[evidence.near[gone].indices], minlength=model.count) > 0
-        reached |= model.adjacent(evidence.adjacency)[body]
+        reached |= neighbours_of(model.contacts(evidence.adjacency)[body])
         reached[body] = False
         affected = np.flatnonzero(reached)
         allowed = np.zeros((len(gone), model.count), bool)

@@ -174,8 +174,7 @@ def _judge(
     members, touching = np.flatnonzero(model.label == body), contacts[body]
     if not len(members) or not touching.any():
         return Candidate(body, np.inf, -1, np.inf, np.inf)
-    # few samples may touch others in fewer places
-    neighbours = np.flatnonzero(touching >= min(_LEAST_CONTACTS, touching.max()))
+    neighbours = np.flatnonzero(neighbours_of(touching))
     some = members
     if len(members) > _MOST_SAMPLES:
         some = members[np.linspace(0, len(members) - 1, _MOST_SAMPLES).astype(int)]
@@ -197,6 +196,14 @@ def _judge(
     size = float(evidence.counts[members].sum()) / max(criterion.min_fraction * len(model.label), 1e-12)
     by_evidence *= min(size, 1.0)
     return Candidate(body, min(by_evidence, by_turn), into if by_turn < by_evidence else -1, turn, by_evidence)
+
+
+def neighbours_of(touching: np.ndarray) -> np.ndarray:
+    """Which bodies are neighbours of one that touches each of them in so many places, (B,) int: (B,) bool.
+
+    Few samples may touch others in few places: those that it touches most are its neighbours then.
+    """
+    return touching >= max(min(_LEAST_CONTACTS, touching.max()), 1)
 
 
 def _explained(

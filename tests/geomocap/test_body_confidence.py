@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from geomocap.bodies.body_evidence import Borders, Criterion, held_together, judge
+from geomocap.bodies.body_elimination import remove
+from geomocap.bodies.body_evidence import Borders, Candidate, Criterion, held_together, judge
 from geomocap.bodies.body_model import model_of_labels
 from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.bodies.first_bodies import first_bodies
@@ -96,3 +97,22 @@ def test_few_samples_that_hardly_touch_others_are_no_body(three):
     criterion = Criterion(settings.least_turn(rigid=False), first.noise, settings.min_fraction, settings.soft_fraction)
     (candidate,) = judge([3], model, evidence.with_places_open(), criterion).values()
     assert candidate.strength < 0.5
+
+
+def test_a_body_that_touches_others_in_one_place_only_goes(three):
+    paths, settings = MotionPaths(three.positions), MotionBodiesSettings()
+    first = first_bodies(*complete_tracks(paths), paths, settings)
+    # a single sample is body 0; it touches one other and is near none that another body has
+    label = three.body + 1
+    lone = int(np.argmin(three.positions[:, 0, 0]))
+    label[lone] = 0
+    other = int(np.flatnonzero(label == 1)[0])
+    few = first.evidence.adjacency.tolil(copy=True)
+    few[lone], few[:, lone] = 0, 0
+    few[lone, other] = few[other, lone] = 1
+    near = first.evidence.near.tolil(copy=True)
+    near[lone], near[:, lone] = 0, 0
+    near[lone, lone] = 1
+    evidence = replace(first.evidence, adjacency=few.tocsr(), near=near.tocsr())
+    model, _ = remove(Candidate(0, 0.5, -1, 1.0, 0.5), model_of_labels(label, evidence), evidence)
+    assert model.label[lone] == 1
