@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from geomocap.patches.frame_views import FrameViews
 from geomocap.scheduling import map_here
 
-_FLOW_WINDOW = (13, 13)  # pixels
-_FLOW_LEVELS = 3  # of the pyramid
+_LEAST_IMAGE = 48  # pixels; a subject has more with its margin. Images narrower than 32 crash OpenCV 5.0
 _CONTRAST = 3.0  # bytes a grey level
 _FLOW_SIGMA = 1.5  # px; residual from which a camera's flow counts less
 _WEAK = 0.3  # m; a shift that no camera sees is taken as zero with this standard deviation
@@ -26,7 +25,12 @@ def extrapolate(
 
 
 def image_flow(previous: FrameViews, view: FrameViews, positions: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Follow the patches' centres in each image with pyramidal Lucas–Kanade: (N, C, 2) px, NaN where not followed.
+    """Follow the patches' centres in each image by dense inverse search: (N, C, 2) px, NaN where not seen.
+
+    Kroeger, Timofte, Dai, Van Gool, *Fast Optical Flow using Dense Inverse Search*, ECCV 2016. Beside following each
+    point by itself (Lucas, Kanade) it takes a quarter of the time, and is farther off where images change little (0.4
+    px instead of 0.1), which aligning mends; of a galloping stag it is less than 3 px off for 0.93 of the patches
+    instead of 0.85.
 
     Parameters
     ----------
@@ -46,13 +50,11 @@ def image_flow(previous: FrameViews, view: FrameViews, positions: np.ndarray, se
             return
         box = _box(both, 24)
         before, after = (_bytes(v.levels[-1, c][box]) for v in (previous, view))
-        corner = np.array([box[1].start, box[0].start], float)
-        start = (pixel[rows, c] - corner).astype(np.float32)[:, None]
-        found, status, _ = cv2.calcOpticalFlowPyrLK(
-            before, after, start, start.copy(), winSize=_FLOW_WINDOW, maxLevel=_FLOW_LEVELS
-        )
-        moved = (found - start)[:, 0].astype(float)
-        flow[rows, c] = np.where(status == 1, moved, np.nan)
+        if min(before.shape) < _LEAST_IMAGE:
+            return
+        moved = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(before, after, None)
+        column, row = (np.rint(pixel[rows, c]) - [box[1].start, box[0].start]).astype(int).T
+        flow[rows, c] = moved[row.clip(0, len(moved) - 1), column.clip(0, moved.shape[1] - 1)]
 
     map_here(follow, range(view.count))
     return flow

@@ -131,7 +131,7 @@ def search(state: Followed, previous: FrameViews, view: FrameViews, settings: Tr
         seen = _asked(patches, unsure, patches.positions, patches.frames, previous, settings)[unsure]
         lifted = onward[0].copy()
         lifted[unsure] = some + lift_flow(previous, some, image_flow(previous, view, some, seen))
-        start, _ = _best_start(patches, unsure, [start, (lifted, onward[1])], view, settings)
+        start, _ = _best_start(patches, unsure, [start, (lifted, onward[1])], view, settings, fit)
     found = _align(state, wanted, start, view, settings)
     # those that are doubtful try again with the motion of one of their neighbours
     new = np.ones(N, bool)
@@ -236,11 +236,15 @@ def _best_start(
     starts: list[tuple[np.ndarray, np.ndarray]],
     view: FrameViews,
     settings: TrackingSettings,
+    fit: np.ndarray | None = None,
 ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Compare starts on the coarse level; return the best for each patch, and its correlation."""
-    best = np.full(len(patches), -3.0)
+    """Compare starts on the coarse level; return the best for each patch, and its correlation.
+
+    `fit` is that of the first start, (N,), where it is known.
+    """
+    best = np.full(len(patches), -3.0) if fit is None else fit.copy()
     X, Q = starts[0][0].copy(), starts[0][1].copy()
-    for positions, frames in starts:
+    for positions, frames in starts if fit is None else starts[1:]:
         use = _asked(patches, which, positions, frames, view, settings)
         tried = align(patches, which, positions, frames, use, view, iterations=(0, -1), least_correlation=-1.0)
         better = tried.correlation > best + 1e-3
