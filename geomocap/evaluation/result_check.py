@@ -68,16 +68,19 @@ def check_run(run: Run, capture: Capture) -> SelfCheck | None:
     return check_result(capture.cameras, _looks(motion), views, rig, mesh, motion, residual)
 
 
-def model_overlap(run: Run, capture: Capture, model: SubjectModel, skeleton: Skeleton) -> float:
+def model_overlap(
+    run: Run, capture: Capture, model: SubjectModel, skeleton: Skeleton, frames: range | None = None
+) -> float:
     """Overlap of a model, drawn in the motion of its skeleton, with a run's silhouettes: the mean over their images.
 
-    It says, without any truth, which of several results for one recording explains the images best.
+    It says, without any truth, which of several results for one recording, or for some `frames` of it, explains the
+    images best.
     """
     capture = as_seen(run, capture)
     mesh, motion, views = model_mesh(model, MESH_TRIANGLES), motion_of(skeleton), _views(run, capture)
     rig = capture.rig.undistorted()
-    drawn = np.array([_drawn_overlaps(mesh, motion, views(frame), rig, frame) for frame in _looks(motion)])
-    return float(np.nanmean(drawn))
+    looks = _looks(motion) if frames is None else [frames[k] for k in evenly_chosen(len(frames), FRAMES)]
+    return float(np.nanmean([_drawn_overlaps(mesh, motion, views(frame), rig, frame) for frame in looks]))
 
 
 def _looks(motion: BodyMotion) -> list[int]:

@@ -52,7 +52,8 @@ def image_flow(previous: FrameViews, view: FrameViews, positions: np.ndarray, se
         before, after = (_bytes(v.levels[-1, c][box]) for v in (previous, view))
         if min(before.shape) < _LEAST_IMAGE:
             return
-        moved = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(before, after, None)
+        search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        moved = search.calc(before, after, None)  # type: ignore[call-overload]
         column, row = (np.rint(pixel[rows, c]) - [box[1].start, box[0].start]).astype(int).T
         flow[rows, c] = moved[row.clip(0, len(moved) - 1), column.clip(0, moved.shape[1] - 1)]
 

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from geomocap.errors import GeometryError
 from geomocap.evaluation.result_check import model_overlap
-from geomocap.model.frame_geometry import Geometry
+from geomocap.model.frame_geometry import Geometry, GeometryPart
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.motion import Motion
 from geomocap.nodes.surface_coverage import SMALLEST_PIECE
 from geomocap.pipeline.following_stage import model_skeleton
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.window_following import surfaces_of
-from geomocap.skeleton.kinematics import BodyMotion, joint_motion
+from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, body_motion, joint_motion
 from geomocap.subject.model_building import BodyCloud, build_model
 from geomocap.subject.model_following import fit_motion
 from geomocap.subject.subject_model import SubjectModel
+from geomocap.subject.window_motion import joined_motion
 
 # Power of what the paths miss, beside what the model's drawn surface misses of the silhouettes. Of two results each of
 # fourteen sets of paths, of thirteen captures, the better was taken with any power from 0.15 to 0.48 in twelve, with
 # 0.5 in eleven, with 0 in nine; in one of the others neither was better. All had been looked at before it was set.
 _PATHS = 0.3
+_GOING_OVER = 3  # frames in which a motion goes over into the fit, and back
 
 
 def make_model(job: Job, geometry: Geometry, motion: Motion) -> SubjectModel | str:
@@ -55,28 +59,73 @@ def misfit(motion: Motion, overlap: float) -> float:
 
 
 def fitted_to_surfaces(
-    job: Job, geometry: Geometry, model: SubjectModel, motion: Motion, paths: MotionPaths, before: float | None = None
-) -> BodyMotion | None:
-    """Fit a motion's model to the surfaces of all frames if no path shows some body in some frame.
+    job: Job, geometry: Geometry, model: SubjectModel, motion: Motion, paths: MotionPaths
+) -> tuple[BodyMotion, int] | None:
+    """Fit a motion's model to the surfaces where no path shows some body: its motion then, and in how many frames.
 
-    The fit is kept if the model then overlaps the silhouettes more, by at least what the smallest piece of a surface
-    is: a surface alone knows less than paths do where these are. `paths` are those that the motion was found from,
-    `before` the overlap without a fit, where it is known. None: nothing is to be fitted, or the fit isn't kept.
+    A surface alone knows less than paths do where these are: the other frames stay as they were found. A stretch of
+    frames is taken from the fit if the model then overlaps their silhouettes more, by at least what the smallest piece
+    of a surface is. `paths` are those that the motion was found from. None: nothing is to be fitted, or no fit is kept.
     """
-    if job.capture is None or (motion.bodies.reliability > 0).all():
+    unseen = (motion.bodies.reliability == 0).any(axis=1)
+    if job.capture is None or not unseen.any():
         return None
-    found = motion.skeleton
-    if before is None:
-        before = silhouette_overlap(job, model, motion)
-    start = joint_motion(model.linkage, found.body_rotations, found.root_positions)
+    found = joint_motion(model.linkage, motion.skeleton.body_rotations, motion.skeleton.root_positions)
+    bodies, kept = body_motion(model.linkage, found), 0
+    with job.run.timed("fit") as count:
+        for stretch in _stretches(unseen):
+            fit = _fitted(job, geometry, model, found, stretch, paths)
+            if fit is None:
+                continue
+            after = _put_in(model.linkage, bodies, stretch, fit)
+            least = _overlap(job, model, bodies, stretch) + SMALLEST_PIECE
+            if _overlap(job, model, after, stretch) >= least:
+                bodies, kept = after, kept + len(stretch)
+        count["items"] = int(unseen.sum())
+    return (bodies, kept) if kept else None
+
+
+def _stretches(unseen: np.ndarray) -> list[range]:
+    """Stretches of frames that are marked, (T,) bool, with those between them that are too few to go over in."""
+    found: list[range] = []
+    for t in np.flatnonzero(unseen).tolist():
+        if found and t - found[-1].stop < 2 * _GOING_OVER:
+            found[-1] = range(found[-1].start, t + 1)
+        else:
+            found.append(range(t, t + 1))
+    return found
+
+
+def _around(stretch: range, frames: int) -> range:
+    """Return a stretch with the frames in which one motion goes over into the other."""
+    return range(max(stretch.start - _GOING_OVER, 0), min(stretch.stop + _GOING_OVER, frames))
+
+
+def _fitted(
+    job: Job, geometry: Geometry, model: SubjectModel, found: JointMotion, stretch: range, paths: MotionPaths
+) -> BodyMotion | None:
+    """Fit the model in and around a stretch; None if a frame shows next to nothing of the subject."""
+    part = _around(stretch, len(geometry))
+    frames = slice(part.start, part.stop)
+    read, settings = surfaces_of(GeometryPart(geometry, part), model), job.config.following
+    start, seen = found.part(frames), paths.part(frames)
     try:
-        with job.run.timed("fit") as count:
-            followed = fit_motion(
-                model, start, surfaces_of(geometry, model), geometry.spacing, paths, job.config.following, job.progress
-            )
-            count["items"] = len(geometry)
-    except GeometryError:  # a frame shows next to nothing of the subject
+        return fit_motion(model, start, read, geometry.spacing, seen, settings, job.progress).bodies
+    except GeometryError:
         return None
-    skeleton = model_skeleton(model, followed.bodies, job.fps)
-    after = model_overlap(job.run, job.capture, model.reposed(followed.bodies, 0), skeleton)
-    return None if after < before + SMALLEST_PIECE else followed.bodies
+
+
+def _put_in(linkage: Linkage, bodies: BodyMotion, stretch: range, fit: BodyMotion) -> BodyMotion:
+    """Put the fit of a stretch into a motion."""
+    frames = len(bodies.rotations)
+    windows = [range(stretch.start), _around(stretch, frames), range(stretch.stop, frames)]
+    motions = [bodies.part(slice(windows[0].stop)), fit, bodies.part(slice(stretch.stop, None))]
+    some = [k for k, window in enumerate(windows) if len(window)]
+    return joined_motion(linkage, [windows[k] for k in some], [motions[k] for k in some])
+
+
+def _overlap(job: Job, model: SubjectModel, bodies: BodyMotion, stretch: range) -> float:
+    """Overlap of a moved model with the silhouettes of a stretch."""
+    assert job.capture is not None
+    skeleton = model_skeleton(model, bodies, job.fps)
+    return model_overlap(job.run, job.capture, model.reposed(bodies, 0), skeleton, stretch)

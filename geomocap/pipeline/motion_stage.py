@@ -80,13 +80,13 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
         warnings.append(model)
     else:
         write_model(job.run.path / MODEL_FILE, model)
-        fit = fitted_to_surfaces(job, geometry, model, motion, choice[source], best.overlap)
+        fit = fitted_to_surfaces(job, geometry, model, motion, choice[source])
         if fit is not None:
-            write_followed(job, geometry, model, fit)
-            axes = posed(model.linkage, fit, 0).axes
-            unseen = int((bodies.reliability == 0).any(axis=1).sum())
+            fitted, many = fit
+            write_followed(job, geometry, model, fitted)
+            axes = posed(model.linkage, fitted, 0).axes
             warnings.append(
-                f"In {unseen} of {frames} frames no path shows some body; the model was fitted to the surface."
+                f"In {many} of {frames} frames no path shows some body; there the model was fitted to the surface."
             )
     if warnings:
         write_warnings(job.run, warnings)

@@ -60,7 +60,9 @@ class Case:
         self.paths = MotionPaths(places[:, trunk].swapaxes(0, 1), sigma=sigma)
 
     def fit(self) -> BodyMotion | None:
-        return motion_models.fitted_to_surfaces(self.job, self.geometry, self.model, self.motion, self.paths)
+        fit = motion_models.fitted_to_surfaces(self.job, self.geometry, self.model, self.motion, self.paths)
+        assert fit is None or fit[1] == UNSEEN.stop
+        return None if fit is None else fit[0]
 
     def error_deg(self, bodies: BodyMotion) -> float:
         """Greatest error of the arm's turn since the last frame, degrees."""
@@ -116,3 +118,33 @@ def test_silhouettes_and_paths_both_speak_against_a_motion():
     assert of(0.937, [0.016]) < of(0.908, [0.011])  # plain legs that patches lose
     smaller = of(0.9, [1e-5]) / of(0.95, [3e-5])  # the same in other units
     assert smaller == pytest.approx(of(0.9, [0.01]) / of(0.95, [0.03]))
+
+
+def test_frames_that_paths_show_stay_as_they_were_found(case, monkeypatch):
+    overlaps(monkeypatch, 0.70, 0.75)
+    fit = case.fit()
+    beyond = slice(UNSEEN.stop + 3, None)  # before, the fit goes over into what was found
+    turns, expected = (m.rotations @ np.swapaxes(m.rotations[-1:], 2, 3) for m in (fit, case.found))  # since the last
+    np.testing.assert_allclose(turns[beyond], expected[beyond], atol=1e-9)
+
+
+def test_stretches_hold_what_is_between_them_where_it_is_short():
+    def of(*marked: int) -> list[range]:
+        return motion_models._stretches(np.isin(np.arange(40), marked))
+
+    assert of() == []
+    assert of(0, 1, 5, 39) == [range(0, 6), range(39, 40)]
+    assert of(10, 17) == [range(10, 11), range(17, 18)] and of(10, 16) == [range(10, 17)]
+
+
+def test_part_of_paths_leaves_out_samples_that_it_does_not_show():
+    positions = np.random.default_rng(0).normal(size=(3, 6, 3))
+    positions[1, :3] = np.nan
+    turns = np.broadcast_to(np.eye(3), (3, 6, 3, 3))
+    whole = MotionPaths(positions, turns, np.arange(18.0).reshape(3, 6), np.zeros((3, 6, 3)), np.array([0, 1, 2]))
+    part = whole.part(slice(0, 3))
+    np.testing.assert_array_equal(part.positions, positions[[0, 2], :3])
+    np.testing.assert_array_equal(part.sigma, [[0, 1, 2], [12, 13, 14]])
+    assert part.rotations.shape == (2, 3, 3, 3) and part.ray.shape == (2, 3, 3) and part.parts.tolist() == [0, 2]
+    assert MotionPaths(positions, sigma=np.ones(3)).part(slice(2, 6)).sigma.shape == (3,)
+    assert whole.part(slice(0, 1)) is None
