@@ -23,7 +23,7 @@ from geomocap.subject.window_motion import joined_motion
 # fourteen sets of paths, of thirteen captures, the better was taken with any power from 0.15 to 0.48 in twelve, with
 # 0.5 in eleven, with 0 in nine; in one of the others neither was better. All had been looked at before it was set.
 _PATHS = 0.3
-_GOING_OVER = 3  # frames in which a motion goes over into the fit, and back
+_GOING_OVER = 3  # frames in which a motion goes over into the fit, and back; no other number was tried
 
 
 def make_model(job: Job, geometry: Geometry, motion: Motion) -> SubjectModel | str:
@@ -63,9 +63,11 @@ def fitted_to_surfaces(
 ) -> tuple[BodyMotion, int] | None:
     """Fit a motion's model to the surfaces where no path shows some body: its motion then, and in how many frames.
 
-    A surface alone knows less than paths do where these are: the other frames stay as they were found. A stretch of
-    frames is taken from the fit if the model then overlaps their silhouettes more, by at least what the smallest piece
-    of a surface is. `paths` are those that the motion was found from. None: nothing is to be fitted, or no fit is kept.
+    A surface alone knows less than paths do where these are: the other frames stay as they were found. (Overlap of a
+    person on a treadmill, four cameras, by a fit of all frames: 0.735 → 0.774 where paths didn't show some body, 0.828
+    → 0.803 elsewhere; of a stag, a dwarf and a horse it fell everywhere.) A stretch of frames is taken from the fit if
+    the model then overlaps their silhouettes more, by at least what the smallest piece of a surface is. `paths` are
+    those that the motion was found from. None: nothing is to be fitted, or no fit is kept.
     """
     unseen = (motion.bodies.reliability == 0).any(axis=1)
     if job.capture is None or not unseen.any():

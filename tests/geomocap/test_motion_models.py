@@ -123,7 +123,7 @@ def test_silhouettes_and_paths_both_speak_against_a_motion():
 def test_frames_that_paths_show_stay_as_they_were_found(case, monkeypatch):
     overlaps(monkeypatch, 0.70, 0.75)
     fit = case.fit()
-    beyond = slice(UNSEEN.stop + 3, None)  # before, the fit goes over into what was found
+    beyond = slice(UNSEEN.stop + motion_models._GOING_OVER, None)  # before, the fit goes over into what was found
     turns, expected = (m.rotations @ np.swapaxes(m.rotations[-1:], 2, 3) for m in (fit, case.found))  # since the last
     np.testing.assert_allclose(turns[beyond], expected[beyond], atol=1e-9)
 
