@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from geomocap.bodies.body_evidence import Candidate, Criterion, Turns, judge, neighbours_of
-from geomocap.bodies.body_model import BodyModel, Evidence, reassign, refit, settle_rest
+from geomocap.bodies.body_alternatives import best_alternative, remove
+from geomocap.bodies.body_criterion import Criterion
+from geomocap.bodies.body_evidence import Candidate, Turns, judge
+from geomocap.bodies.body_model import BodyModel, Evidence
 
 _FURTHER = 4  # steps beyond the criterion, as alternatives
 _LEAST_BODIES = 2
@@ -47,23 +49,58 @@ class Elimination:
         With places in the reference settled anew.
     curve : tuple of EliminationStep
         With a few steps beyond the criterion.
+    against : (B,) float
+        What each body explains that the others can't however they move, over what its freedoms cost; infinite where
+        that wasn't asked.
     """
 
     model: BodyModel
     evidence: Evidence
     curve: tuple[EliminationStep, ...]
+    against: np.ndarray
 
 
 def eliminate(model: BodyModel, evidence: Evidence, criterion: Criterion, count: int | None) -> Elimination:
     """Take away the weakest body until all are strong enough, or until a given number is left.
 
-    Bodies are judged with places at rest of each sample's own: only motion is compared.
+    Bodies are judged with places at rest of each sample's own: only motion is compared. Beside the others as they move
+    first; those that are left then against the best model without them.
     """
     curve: list[EliminationStep] = []
+    against: dict[int, float] = {}
     model, evidence = _weaken(model, evidence, criterion, count, curve)
-    further = max(_LEAST_BODIES, len(np.unique(model.label)) - _FURTHER)
-    _weaken(model, evidence, criterion, further, curve)
-    return Elimination(model.compact(), evidence, tuple(curve))
+    if count is None:
+        model, evidence, against = _defended(model, evidence, criterion, curve)
+    bodies = np.unique(model.label).tolist()
+    _weaken(model, evidence, criterion, max(_LEAST_BODIES, len(bodies) - _FURTHER), curve)
+    return Elimination(model.compact(), evidence, tuple(curve), np.array([against.get(b, np.inf) for b in bodies]))
+
+
+def _defended(
+    model: BodyModel, evidence: Evidence, criterion: Criterion, curve: list[EliminationStep]
+) -> tuple[BodyModel, Evidence, dict[int, float]]:
+    """Take away the body that the best model without it needs least, until each is needed; what each is worth then."""
+    worth: dict[int, float] = {}
+    while True:
+        judged = judge(np.unique(model.label).tolist(), model, evidence.with_places_open(), criterion)
+        asked = [b for b in judged if b not in worth and np.isfinite(judged[b].strength)]
+        worth |= {b: best_alternative(judged[b], model, evidence, criterion).evidence for b in asked}
+        weakest = min(worth, key=lambda b: (worth[b], b), default=-1)
+        if weakest < 0 or worth[weakest] >= 1.0 or len(judged) <= _LEAST_BODIES:
+            return model, evidence, worth
+        before, candidate = model, judged[weakest]
+        curve[-1] = _step(model, candidate, worth[weakest])
+        best = best_alternative(candidate, model, evidence, criterion)
+        model, evidence = _weaken(best.model, best.known, criterion, None, curve)
+        stale, _ = _changed(before, model, evidence)
+        left = np.unique(model.label)
+        worth = {b: value for b, value in worth.items() if b in left and not stale[b]}
+
+
+def _step(model: BodyModel, weakest: Candidate, strength: float) -> EliminationStep:
+    bodies, label = np.unique(model.label, return_inverse=True)
+    turn_deg = float(np.rad2deg(weakest.turn))
+    return EliminationStep(len(bodies), strength, turn_deg, weakest.evidence, label.astype(np.int32))
 
 
 def _weaken(
@@ -79,9 +116,7 @@ def _weaken(
         weakest = min(known.values(), key=lambda c: (c.strength, c.body))
         if curve and curve[-1].bodies == len(bodies):  # judged anew
             curve.pop()
-        label = np.unique(model.label, return_inverse=True)[1].astype(np.int32)
-        turn_deg = float(np.rad2deg(weakest.turn))
-        curve.append(EliminationStep(len(bodies), weakest.strength, turn_deg, weakest.evidence, label))
+        curve.append(_step(model, weakest, weakest.strength))
         enough = weakest.strength >= 1.0 if count is None else len(bodies) <= count
         if enough or len(bodies) == 1 or not np.isfinite(weakest.strength):
             return model, evidence
@@ -112,35 +147,3 @@ def _changed(before: BodyModel, after: BodyModel, evidence: Evidence) -> tuple[n
     turned[after.label[before.core != after.core]] = True
     touching = (before.contacts(evidence.adjacency) + after.contacts(evidence.adjacency)) > 0
     return changed | touching[changed].any(axis=0), turned
-
-
-def remove(candidate: Candidate, model: BodyModel, evidence: Evidence) -> tuple[BodyModel, Evidence]:
-    """Take a body away: its samples go to the neighbour that turns alike, or to blends of the neighbours.
-
-    All others stay, for the borders of the first grouping are truer than those of samples that choose anew, which drift
-    on soft skin. Where single cameras follow the surface all choose anew, as each body puts them at another depth.
-    """
-    body = candidate.body
-    gone = np.flatnonzero(model.label == body)
-    label, partner, fraction = model.label.copy(), model.partner.copy(), model.fraction.copy()
-    if candidate.into >= 0:
-        label[gone], partner[gone], fraction[gone] = candidate.into, -1, 1.0
-        affected = np.array([candidate.into])
-    else:
-        reached = np.bincount(model.label[evidence.near[gone].indices], minlength=model.count) > 0
-        reached |= neighbours_of(model.contacts(evidence.adjacency)[body])
-        reached[body] = False
-        affected = np.flatnonzero(reached)
-        allowed = np.zeros((len(gone), model.count), bool)
-        allowed[:, affected] = True
-        any_pair = np.ones((model.count, model.count), bool)
-        blends = evidence.explain(gone, model, allowed, any_pair, evidence.penalty)
-        rows = np.arange(len(gone))
-        label[gone] = blends.costs.argmin(axis=1)
-        partner[gone], fraction[gone] = blends.partner[rows, label[gone]], blends.fraction[rows, label[gone]]
-    orphaned = partner == body
-    partner[orphaned], fraction[orphaned] = -1, 1.0
-    left = replace(model, label=label, partner=partner, fraction=fraction)
-    evidence = settle_rest(left, evidence)
-    left = refit(left, evidence, affected)
-    return (left if evidence.ray is None else reassign(left, evidence, 1)), evidence

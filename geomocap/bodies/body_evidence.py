@@ -35,23 +35,19 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse.csgraph import minimum_spanning_tree
 
+from geomocap.bodies.body_criterion import Criterion
+from geomocap.bodies.body_joints import Borders, held_together, neighbours_of, parted, parting, shown
 from geomocap.bodies.body_model import BodyModel, Evidence
 from geomocap.bodies.rigid_motions import relative_turn
 from geomocap.bodies.skin_blending import blend_spans
-from geomocap.bodies.surface_noise import SurfaceNoise
 
 _FREEDOMS = 3  # of a turn
-_OF_A_JOINT = 3  # directions in which it holds two bodies together
 _FITTED = 6  # freedoms that were fitted to a body's own samples
-_NO_EDGE = 1e-9  # what a joint costs at least: 0 would be no edge of the tree
 _MOST_SAMPLES = 80
 _MOST_NEIGHBOURS = 7
-_LEAST_CONTACTS = 3
 _LEAST_SEEN = 0.1
 _LEAST_SAMPLES = 3  # that tell a motion
-_LEAST_FRAMES = 5
 TURN_FRACTION = 0.02  # of the frames, in which a turn may be larger
 # Noise turns n samples by three angles, each of variance s²/2 / (n radius²); with the 98th percentile of their χ²:
 _FEIGNED = 9.84 / 2.0
@@ -61,28 +57,6 @@ _TIP_QUANTILE = 0.8
 # about so many times as much as those side by side. 2 merged soft joints of a man, 1.5 didn't; both mended a machine.
 _NOISE_FACTOR = 1.5
 _UNEVEN = np.deg2rad(10.0)  # samples side by side that turn more differently are unsure
-
-
-@dataclass(frozen=True)
-class Criterion:
-    """When a body is one.
-
-    Attributes
-    ----------
-    min_turn : float, radians
-        It turns at least this much against each neighbour, or slides as far, beyond what noise feigns;
-    noise : SurfaceNoise
-        blends of its neighbours miss its samples by more than this noise and its freedoms are worth;
-    min_fraction : float
-        of fewer samples than this fraction, it needs as much more evidence.
-    softness : float
-        Soft skin differs from a blend of two bodies by up to this fraction of how far these turn it apart.
-    """
-
-    min_turn: float
-    noise: SurfaceNoise
-    min_fraction: float
-    softness: float
 
 
 @dataclass(frozen=True)
@@ -111,33 +85,13 @@ class Candidate:
     @property
     def confidence(self) -> float:
         """0 to 1: 1/2 where what speaks for the body is just what is required, 2/3 where it is twice that."""
-        return 1.0 if np.isinf(self.strength) else self.strength / (1.0 + self.strength)
+        return float(confidence_of(np.array(self.strength)))
 
 
-@dataclass(frozen=True)
-class Borders:
-    """Where bodies touch.
-
-    Attributes
-    ----------
-    contacts : (B, B) int
-        Neighbouring pairs of samples of each two bodies.
-    places : (B, B, 3) float, metres
-        Middle of these, of different bodies; without meaning where they don't touch.
-    """
-
-    contacts: np.ndarray
-    places: np.ndarray
-
-    @classmethod
-    def of(cls, model: BodyModel, evidence: Evidence) -> Borders:
-        """Find where the bodies of a model touch."""
-        contacts = model.contacts(evidence.adjacency)
-        rows, columns = evidence.adjacency.nonzero()
-        pair = model.count * model.label[rows] + model.label[columns]
-        middle = 0.5 * (evidence.rest[rows] + evidence.rest[columns])
-        sums = np.stack([np.bincount(pair, along, model.count**2) for along in middle.T], axis=1)
-        return cls(contacts, sums.reshape(*contacts.shape, 3) / np.maximum(contacts, 1)[..., None])
+def confidence_of(strength: np.ndarray) -> np.ndarray:
+    """Confidences, 0 to 1, of what speaks for bodies, as a fraction of what is required; see `Candidate`."""
+    result: np.ndarray = 1.0 - 1.0 / (1.0 + strength)
+    return result
 
 
 # Of two bodies, the lower number first, against each other: turn, radians, and slide, radii of the larger one
@@ -162,8 +116,7 @@ def judge(
         Turns that are known already; what is found is added.
     """
     borders, turns = Borders.of(model, evidence), {} if turns is None else turns
-    seen_alone = np.ascontiguousarray(np.where(evidence.seen, evidence.weights, 0.0))  # gaps are filled by guesses
-    evidence = replace(evidence, weights=seen_alone)
+    evidence = only_seen(evidence)
     return {b: _judge(b, model, evidence, criterion, borders, turns) for b in bodies}
 
 
@@ -175,14 +128,10 @@ def _judge(
     if not len(members) or not touching.any():
         return Candidate(body, np.inf, -1, np.inf, np.inf)
     neighbours = np.flatnonzero(neighbours_of(touching))
-    some = members
-    if len(members) > _MOST_SAMPLES:
-        some = members[np.linspace(0, len(members) - 1, _MOST_SAMPLES).astype(int)]
-    samples = criterion.noise.independent(evidence.rest[some], len(members)) * _coverage(evidence.seen[members])
-    observations = _directions(members, evidence) * samples
+    some, samples, observations = observed(members, evidence, criterion)
     nats, own = _explained(body, neighbours, some, observations, model, evidence, criterion)
     nats += held_together(body, neighbours, model, evidence, criterion, borders)
-    by_evidence = nats / (0.5 * _FREEDOMS * np.log(max(observations, math.e)))
+    by_evidence = of_required(nats, observations, members, evidence, criterion)
     # what noise feigns is no turn
     inertia = max(samples, 1.0) * _square_radius(evidence.rest[members])
     feigned = _FEIGNED * max(criterion.noise.variance, own) / max(inertia, 1e-12)
@@ -193,17 +142,29 @@ def _judge(
     turns = [math.hypot(turn, math.sqrt(slide**2 - joined**2)) for turn, slide in motions]
     turn = float(np.sqrt(max(min(turns) ** 2 - feigned, 0.0)))
     by_turn, into = turn / criterion.min_turn, int(neighbours[int(np.argmin(turns))])
-    size = float(evidence.counts[members].sum()) / max(criterion.min_fraction * len(model.label), 1e-12)
-    by_evidence *= min(size, 1.0)
     return Candidate(body, min(by_evidence, by_turn), into if by_turn < by_evidence else -1, turn, by_evidence)
 
 
-def neighbours_of(touching: np.ndarray) -> np.ndarray:
-    """Which bodies are neighbours of one that touches each of them in so many places, (B,) int: (B,) bool.
+def observed(members: np.ndarray, evidence: Evidence, criterion: Criterion) -> tuple[np.ndarray, float, float]:
+    """Evenly chosen samples of a body, and how many independent samples and observations of directions it has."""
+    some = members
+    if len(members) > _MOST_SAMPLES:
+        some = members[np.linspace(0, len(members) - 1, _MOST_SAMPLES).astype(int)]
+    samples = criterion.noise.independent(evidence.rest[some], len(members)) * _coverage(evidence.seen[members])
+    return some, samples, _directions(members, evidence) * samples
 
-    Few samples may touch others in few places: those that it touches most are its neighbours then.
-    """
-    return touching >= max(min(_LEAST_CONTACTS, touching.max()), 1)
+
+def of_required(
+    nats: float, observations: float, members: np.ndarray, evidence: Evidence, criterion: Criterion
+) -> float:
+    """Log likelihood that a body adds, over what its freedoms cost: less where its samples are too few."""
+    size = float(evidence.counts[members].sum()) / max(criterion.min_fraction * len(evidence.rest), 1e-12)
+    return nats / (0.5 * _FREEDOMS * math.log(max(observations, math.e))) * min(size, 1.0)
+
+
+def only_seen(evidence: Evidence) -> Evidence:
+    """The same, of what is seen alone: gaps are filled by guesses."""
+    return replace(evidence, weights=np.ascontiguousarray(np.where(evidence.seen, evidence.weights, 0.0)))
 
 
 def _explained(
@@ -231,19 +192,37 @@ def _explained(
     found.costs[:, body] = np.inf  # without it
     row, main = np.arange(len(some)), found.costs.argmin(axis=1)
     missed, partner, fraction = found.costs[row, main], found.partner[row, main], found.fraction[row, main]
+    noise = noise_of(some, main, partner, fraction, model, evidence, criterion)
+    # what was fitted to few independent observations leaves less than they really miss
+    gain = np.maximum(np.log((noise + missed) / (noise + fitted(observations) * own)), 0.0)
+    return 0.5 * observations * float(gain.mean()), float(own.mean())
+
+
+def fitted(observations: float) -> float:
+    """What a body really misses its samples by, as a multiple of what is left of so many after its fit to them."""
+    return observations / max(observations - _FITTED, 1.0)
+
+
+def noise_of(
+    some: np.ndarray,
+    main: np.ndarray,
+    partner: np.ndarray,
+    fraction: np.ndarray,
+    model: BodyModel,
+    evidence: Evidence,
+    criterion: Criterion,
+) -> np.ndarray:
+    """Mean square by which blends may miss their samples, (n,), metres²: noise, and the softness of skin."""
     stated = 3.0 * evidence.sigma[some] ** 2
     if evidence.ray is not None:  # what one camera alone sees is as unsure as its depth says, which hardly counts
         stated[evidence.lone[some].any(axis=1)] = 0.0
-    noise = np.maximum(criterion.noise.variance, stated)
+    noise: np.ndarray = np.maximum(criterion.noise.variance, stated)
     if criterion.softness > 0:
         apart = _turned_apart(some, main, partner, model, evidence, criterion)
         # a swing of the least turn to and fro moves what lies around its middle by the mean square a² r² / 3
         soft = 4.0 * fraction * (1.0 - fraction) * criterion.softness**2 * apart
         noise += np.minimum(soft, criterion.min_turn**2 / 3.0 * _square_radius(evidence.rest[some]))
-    # what was fitted to few independent observations leaves less than they really miss
-    fitted = observations / max(observations - _FITTED, 1.0)
-    gain = np.maximum(np.log((noise + missed) / (noise + fitted * own)), 0.0)
-    return 0.5 * observations * float(gain.mean()), float(own.mean())
+    return noise
 
 
 def _turned_apart(
@@ -266,7 +245,7 @@ def _turned_apart(
         return apart
     middle = rest.mean(axis=0)
     for one, other in np.unique(np.stack([main, partner])[:, partner >= 0], axis=1).T.tolist():
-        parted = _parting(one, other, middle, model, evidence, criterion).var(axis=0).sum()
+        parted = parting(one, other, middle, model, evidence, criterion).var(axis=0).sum()
         apart[(main == one) & (partner == other)] -= parted
     return np.maximum(apart, 0.0)
 
@@ -301,54 +280,9 @@ def _motion(
     turn = _turn(first, second, model, evidence)
     if evidence.ray is not None:
         return turn, 0.0
-    miss = _parted(first, second, borders.places[first, second], model, evidence, criterion)
+    miss = parted(first, second, borders.places[first, second], model, evidence, criterion)
     radius = max(_square_radius(evidence.rest[model.label == body]) for body in (first, second))
     return turn, float(np.sqrt(miss / max(radius, 1e-12)))
-
-
-def held_together(
-    body: int, neighbours: np.ndarray, model: BodyModel, evidence: Evidence, criterion: Criterion, borders: Borders
-) -> float:
-    """Log likelihood that a body adds to that of the joints of its neighbours, in nats: 0 with one neighbour.
-
-    Joints are those of the tree that parts least. Without the body its neighbours meet where they touch each other, or
-    where they touched the body, which hangs on one of them.
-    """
-    joined = [body, *neighbours.tolist()]
-    costs = np.zeros((len(joined), len(joined)))
-    for i in range(1, len(joined)):
-        for k in range(i):
-            pair = joined[i], joined[k]
-            places = [borders.places[pair]] if borders.contacts[pair] else []
-            if k > 0:
-                places += [borders.places[body, one] for one in pair]
-            miss = min(_parted(*pair, place, model, evidence, criterion) for place in places)
-            costs[i, k] = math.log1p(miss / criterion.noise.variance) + _NO_EDGE
-    alone, together = (minimum_spanning_tree(some).sum() for some in (costs[1:, 1:], costs))
-    return 0.5 * _OF_A_JOINT * float(alone + costs[1:, 0].min() - together)
-
-
-def _parted(
-    first: int, second: int, place: np.ndarray, model: BodyModel, evidence: Evidence, criterion: Criterion
-) -> float:
-    """Mean square by which two bodies' motions carry their best common point near a place (3,) apart, metres²."""
-    return float((_parting(first, second, place, model, evidence, criterion) ** 2).sum(axis=1).mean())
-
-
-def _parting(
-    first: int, second: int, place: np.ndarray, model: BodyModel, evidence: Evidence, criterion: Criterion
-) -> np.ndarray:
-    """How two bodies' motions carry their best common point near a place (3,) apart, (K, 3), metres.
-
-    In the frames that show both. A point off the place costs as much as if the least turn of a body moved it.
-    """
-    known = _shown(first, second, model, evidence)
-    turned = model.rotations[first, known] - model.rotations[second, known]
-    apart = turned @ place + model.translations[first, known] - model.translations[second, known]
-    normal = np.einsum("tji,tjk->ik", turned, turned) / len(turned) + criterion.min_turn**2 * np.eye(3)
-    moved = -np.linalg.solve(normal, np.einsum("tji,tj->i", turned, apart) / len(turned))
-    parting: np.ndarray = turned @ moved + apart
-    return parting
 
 
 def _turn(first: int, second: int, model: BodyModel, evidence: Evidence) -> float:
@@ -357,7 +291,7 @@ def _turn(first: int, second: int, model: BodyModel, evidence: Evidence) -> floa
     What samples side by side turn differently is noise, which is taken from that of the parts; where it is so much that
     they are unsure, that of the motions counts more.
     """
-    known = _shown(first, second, model, evidence)
+    known = shown(first, second, model, evidence)
     one, other = model.rotations[first, known], model.rotations[second, known]
     if min(evidence.seen[model.label == body, 0].sum() for body in (first, second)) < 3:
         # nothing ties the body to frame 0: its turn counts from the middle of the frames
@@ -375,17 +309,3 @@ def _turn(first: int, second: int, model: BodyModel, evidence: Evidence) -> floa
     tips = float(np.sqrt(max(tips**2 - (_NOISE_FACTOR * uneven) ** 2, 0.0)))
     fraction = 0.5 * min(1.0, (_UNEVEN / max(float(uneven), 1e-9)) ** 2)
     return (1.0 - fraction) * turn + fraction * tips
-
-
-def _shown(first: int, second: int, model: BodyModel, evidence: Evidence) -> np.ndarray:
-    """Frames that show both of two bodies, (T,) bool; all where these are too few."""
-    known = _seen(first, model, evidence) & _seen(second, model, evidence)
-    if known.sum() < min(_LEAST_FRAMES, len(known)):
-        known[:] = True
-    return known
-
-
-def _seen(body: int, model: BodyModel, evidence: Evidence) -> np.ndarray:
-    """Frames in which enough samples of a body are seen to know its motion, (T,) bool."""
-    seen = evidence.seen[model.label == body]
-    return seen.sum(axis=0) >= max(_LEAST_SAMPLES, _LEAST_SEEN * len(seen))

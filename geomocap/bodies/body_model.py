@@ -247,23 +247,46 @@ def carry(rotations: np.ndarray, translations: np.ndarray, rest: np.ndarray) -> 
     return (rest @ rotations.transpose(0, 2, 1) + translations[:, None]).swapaxes(0, 1)
 
 
-def reassign(model: BodyModel, evidence: Evidence, rounds: int) -> BodyModel:
-    """Let each sample follow what explains it and its neighbours best among the bodies near it; fit; repeat."""
-    samples = np.arange(len(model.label))
-    average = _average_of_neighbours(evidence.adjacency)
-    keep = 1.0 - evidence.smoothness
+def reassign(
+    model: BodyModel,
+    evidence: Evidence,
+    rounds: int,
+    samples: np.ndarray | None = None,
+    bodies: np.ndarray | None = None,
+) -> BodyModel:
+    """Let each sample follow what explains it and its neighbours best among the bodies near it; fit; repeat.
+
+    Parameters
+    ----------
+    model : BodyModel
+    evidence : Evidence
+    rounds : int
+        At most; fewer where hardly a sample moves.
+    samples : (n,) int, optional
+        Those that choose; all.
+    bodies : (m,) int, optional
+        Those that they may choose; all.
+    """
+    samples = np.arange(len(model.label)) if samples is None else samples
+    near, average = evidence.near[samples], _average_of_neighbours(evidence.adjacency[samples][:, samples])
+    open_bodies = np.ones(model.count, bool) if bodies is None else np.isin(np.arange(model.count), bodies)
+    keep, row = 1.0 - evidence.smoothness, np.arange(len(samples))
     for _ in range(rounds):
         one = np.eye(model.count)[model.label]
-        allowed = (evidence.near @ one) > 0
+        allowed = ((near @ one) > 0) & open_bodies
+        before = model.label[samples], model.partner[samples], model.fraction[samples]
+        allowed[row, before[0]] |= ~allowed.any(axis=1)
         blends = evidence.explain(samples, model, allowed, model.adjacent(evidence.adjacency), evidence.penalty)
         costs = np.minimum(blends.costs, evidence.cap**2)
         costs = keep * costs + evidence.smoothness * (average @ costs)
         costs[~allowed] = np.inf
-        label = costs.argmin(axis=1)
-        fraction, partner = blends.fraction[samples, label], blends.partner[samples, label]
-        moved = label != model.label
-        changed = moved | (np.abs(fraction - model.fraction) > 0.02) | (partner != model.partner)
-        affected = np.unique(np.concatenate([model.label[changed], label[changed]]))
+        chosen = costs.argmin(axis=1)
+        now = chosen, blends.partner[row, chosen], blends.fraction[row, chosen]
+        moved = now[0] != before[0]
+        changed = moved | (np.abs(now[2] - before[2]) > 0.02) | (now[1] != before[1])
+        affected = np.unique(np.concatenate([before[0][changed], chosen[changed]]))
+        label, partner, fraction = model.label.copy(), model.partner.copy(), model.fraction.copy()
+        label[samples], partner[samples], fraction[samples] = now
         model = refit(replace(model, label=label, partner=partner, fraction=fraction), evidence, affected)
         if moved.mean() < _STEADY:
             break

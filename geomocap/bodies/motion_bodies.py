@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from geomocap.bodies.body_criterion import Criterion
 from geomocap.bodies.body_elimination import EliminationStep, confidences, eliminate
-from geomocap.bodies.body_evidence import Criterion
+from geomocap.bodies.body_evidence import confidence_of
 from geomocap.bodies.body_model import BodyModel, Evidence, reassign
 from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.bodies.connected_linkage import Dendrogram
@@ -188,12 +189,14 @@ def _those_that_are_there(
         left = eliminate(model, evidence, criterion, count or None)
         curve = (*(step for step in curve if step.bodies > left.curve[0].bodies), *left.curve)
         evidence = left.evidence
-        model = reassign(left.model, evidence, 3).compact()
+        model = reassign(left.model, evidence, 3)
+        against, model = left.against[np.unique(model.label)], model.compact()
         confidence = confidences(model, evidence, criterion)
         if count or (confidence >= _IS_ONE).all():
             if evidence.ray is None:  # the borders before that are truer
-                model, confidence = left.model, confidences(left.model, evidence, criterion)
-            return model, evidence, curve, confidence
+                model, against = left.model, left.against
+                confidence = confidences(model, evidence, criterion)
+            return model, evidence, curve, np.minimum(confidence, confidence_of(against))
 
 
 def _criterion(settings: MotionBodiesSettings, noise: SurfaceNoise, rigid: bool) -> Criterion:

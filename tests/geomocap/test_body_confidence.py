@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from geomocap.bodies.body_elimination import remove
-from geomocap.bodies.body_evidence import Borders, Candidate, Criterion, held_together, judge
+from geomocap.bodies.body_alternatives import remove
+from geomocap.bodies.body_criterion import Criterion
+from geomocap.bodies.body_evidence import Candidate, judge
+from geomocap.bodies.body_joints import Borders, held_together
 from geomocap.bodies.body_model import model_of_labels
 from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.bodies.first_bodies import first_bodies
