@@ -11,12 +11,10 @@ import numpy as np
 from numba import njit, prange
 
 from geomocap.errors import CaptureError
+from geomocap.silhouettes.background_noise import noise
 from geomocap.silhouettes.light import light_change
 from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
-LEAST_NOISE = 0.7  # grey levels; 8-bit rounding alone gives 0.29, compression hides the rest in flat parts
-GRADIENT_BINS = 12
-MOST_JITTER = 0.3  # pixels that edges move at most, by compression and vibration
 TEXTURE_WINDOW = 5  # pixels along its side
 LIT = 0.15  # fraction of the frames that must show a place lit for the others to be its shadow
 
@@ -119,7 +117,7 @@ def model_from_plate(
         model.check(image)
     for _ in range(2):
         lights = [_light(image, model, settings) for image in frames]
-        sigma = _noise(frames, lights, model)
+        sigma = noise(frames, lights, model.mean, model.known)
         model = BackgroundModel(_agreeing_mean(frames, lights, mean, sigma), sigma, known, camera)
     return model
 
@@ -187,77 +185,18 @@ def background_over_time(
     known = np.ones(median.shape[:2], bool)
     model = BackgroundModel(median, np.full(known.shape, 2.0, np.float32), known, camera)
     lights = [_light(image, model, settings) for image in frames]
-    sigma = _noise(frames, lights, model)
+    sigma = noise(frames, lights, model.mean, model.known)
     gains = np.array([g for g, _ in lights], np.float32)
     offsets = np.array([o for _, o in lights], np.float32)
     mean, support = agreement(stack, gains, offsets, 3.0 * sigma, LIT)
     model = BackgroundModel(mean, sigma, known, camera)
-    return mean, _noise(frames, lights, model), support
+    return mean, noise(frames, lights, model.mean, model.known), support
 
 
 def _light(image: np.ndarray, model: BackgroundModel, settings: SilhouetteSettings) -> tuple[np.ndarray, np.ndarray]:
     if not settings.gain:
         return np.ones(3), np.zeros(3)
     return light_change(image, model.mean, model.sigma, model.known)
-
-
-def _noise(
-    frames: Sequence[np.ndarray], lights: Sequence[tuple[np.ndarray, np.ndarray]], model: BackgroundModel
-) -> np.ndarray:
-    """Standard deviation of the frames against the background, (H, W) float32.
-
-    Variance a + b · gradient², fitted to robust variances (median absolute deviation, so that the subject does not
-    count) of pixels sorted by the background's gradient: edges move by fractions of a pixel and are compressed worst.
-    """
-    gradient = _gradient(model.mean)
-    step = max(1, int(np.sqrt(gradient.size / 20000)))
-    part = (slice(None, None, step), slice(None, None, step))
-    use = model.known[part] & (model.mean[part] > 6).all(-1) & (model.mean[part] < 249).all(-1)
-    if use.sum() < 50:
-        use = model.known[part]
-    g = gradient[part][use]
-    if g.size < 50:
-        return np.full(gradient.shape, 2.0, np.float32)
-    edges = np.quantile(g, np.linspace(0, 1, GRADIENT_BINS + 1))
-    which = np.clip(np.searchsorted(edges, g, side="right") - 1, 0, GRADIENT_BINS - 1)
-    order = np.argsort(which, kind="stable")
-    g, mean = g[order], model.mean[part][use][order]
-    pixels = np.flatnonzero(use)[order]
-    misses = np.empty((len(g), len(frames), 3))  # those of a class of gradients lie together
-    for t, (image, (gain, offset)) in enumerate(zip(frames, lights, strict=True)):
-        absolute_misses(image[part].reshape(-1, 3), pixels, mean, gain, offset, t, misses)
-    x, y = [], []
-    for inside in np.split(np.arange(len(g)), np.searchsorted(which[order], np.arange(1, GRADIENT_BINS))):
-        if len(inside) >= 20:
-            some = slice(inside[0], inside[-1] + 1)
-            x.append(np.median(g[some]) ** 2)
-            y.append((1.4826 * np.median(misses[some].ravel(), overwrite_input=True)) ** 2)
-    a = max(float(np.median(y[: max(1, len(y) // 2)])), LEAST_NOISE**2)
-    steepest = [max(0.0, v - a) / u for u, v in zip(x, y, strict=True) if u > 4.0][-4:]
-    b = min(float(np.median(steepest)), MOST_JITTER**2) if steepest else 0.0
-    return np.sqrt(a + b * gradient**2).astype(np.float32)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def absolute_misses(image, pixels, mean, gain, offset, frame, misses):
-    """By how much the background in a frame's light misses the frame, in each channel.
-
-    Parameters
-    ----------
-    image : (K, 3) uint8
-    pixels : (n,) int64
-        Which of the frame's pixels.
-    mean : (n, 3) float32
-        Background there.
-    gain, offset : (3,) float64
-    frame : int
-        Number t of the frame.
-    misses : (n, T, 3) float64
-        Filled in for this frame: |image - (gain · mean + offset)|.
-    """
-    for i in range(len(pixels)):
-        for c in range(3):
-            misses[i, frame, c] = abs(image[pixels[i], c] - (gain[c] * mean[i, c] + offset[c]))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -276,12 +215,6 @@ def _texture(mean: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     fine = mean - cv2.blur(mean, window)
     variance = cv2.blur((fine * fine).mean(axis=-1), window)
     return np.maximum(np.float32(0), variance / (sigma * sigma) - np.float32(1))
-
-
-def _gradient(mean: np.ndarray) -> np.ndarray:
-    """Largest gradient of the three channels, grey levels a pixel, (H, W) float32."""
-    dx, dy = cv2.Sobel(mean, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(mean, cv2.CV_32F, 0, 1, scale=1 / 8)
-    return np.sqrt((dx * dx + dy * dy).max(axis=-1))
 
 
 def _agreeing_mean(

@@ -32,33 +32,39 @@ def light_change(
     -------
     gain, offset : (3,) float64
     """
-    h, w = known.shape
-    step = max(1, int(np.sqrt(h * w / SAMPLES)))
-    rows, cols = slice(step // 2, None, step), slice(step // 2, None, step)
-    use = known[rows, cols].ravel()
-    y = image[rows, cols].reshape(-1, 3)[use].astype(np.float64)
-    x = mean[rows, cols].reshape(-1, 3)[use].astype(np.float64)
-    s = sigma[rows, cols].ravel()[use].astype(np.float64)
     gain, offset = np.ones(3), np.zeros(3)
+    step = max(1, int(np.sqrt(known.size / SAMPLES)))
     for c in range(3):
-        ok = (y[:, c] > 4) & (y[:, c] < 251) & (x[:, c] > 4) & (x[:, c] < 251)
-        if ok.sum() < 50:
+        x, y, s = _samples(image, mean, sigma, known, c, step)
+        if len(x) < 50:
             continue
-        xc, yc, sc = x[ok, c], y[ok, c], s[ok]
-        gain[c] = _median(yc / xc)
-        scale = 1.4826 * _median(np.abs(yc - gain[c] * xc) / sc)
-        gain[c], offset[c] = _reweighted_line(xc, yc, sc, gain[c], max(scale, 1.0))
+        gain[c] = _median(y / x)
+        scale = 1.4826 * _median(np.abs(y - gain[c] * x) / s)
+        gain[c], offset[c] = _reweighted_line(x, y, s, gain[c], max(scale, 1.0))
     return gain, offset
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _samples(image, mean, sigma, known, channel, step):
+    """Values of a channel at every so many pixels, neither dark nor overexposed: background, frame, noise, float64."""
+    h, w = known.shape
+    found = np.empty((3, (h // step + 1) * (w // step + 1)))
+    count = 0
+    for y in range(step // 2, h, step):
+        for x in range(step // 2, w, step):
+            before, now = np.float64(mean[y, x, channel]), np.float64(image[y, x, channel])
+            if known[y, x] and 4 < now < 251 and 4 < before < 251:
+                found[0, count], found[1, count], found[2, count] = before, now, sigma[y, x]
+                count += 1
+    return found[0, :count], found[1, :count], found[2, :count]
 
 
 def _median(values: np.ndarray) -> float:
     """Median of some finite values (N,), which change their order: `np.median` takes ten times as long to call."""
     half = len(values) // 2
-    if len(values) % 2:
-        values.partition(half)
-        return float(values[half])
-    values.partition((half - 1, half))
-    return float(values[half - 1] + values[half]) / 2
+    values.partition(half)
+    upper = float(values[half])
+    return upper if len(values) % 2 else float(values[:half].max() + upper) / 2
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
