@@ -231,20 +231,26 @@ def carve(begin, end, P, size, masks, valid, subject, seen, unseen, tolerance, m
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def possible(P, size, subject, seen, unseen, tolerance, min_views, origin, edge, cells):
-    """Mark the cells that may hold a point of the hull: every camera either may, or can't tell."""
+def possible_parts(P, size, subject, seen, unseen, tolerance, min_views, origin, edge, cells):
+    """Divide cells into eight each, of size `edge`, and list those parts that may hold a point of the hull.
+
+    Every camera either may see the subject there, or can't tell. Of each cell the parts are in the order of x, y, z.
+    """
     half = 0.5 * edge
-    possible = np.zeros(len(cells), np.bool_)
+    parts = np.empty((8 * len(cells), 3), np.int64)
+    count = 0
     for n in range(len(cells)):
-        x = origin[0] + (cells[n, 0] + 0.5) * edge
-        y = origin[1] + (cells[n, 1] + 0.5) * edge
-        z = origin[2] + (cells[n, 2] + 0.5) * edge
-        against, views = 0, 0
-        for c in range(P.shape[0]):
-            answer = classify(P, size, subject, seen, unseen, c, x, y, z, half, half, half)
-            views += answer != UNSEEN
-            against += answer == BACKGROUND
-            if against > tolerance:
-                break
-        possible[n] = against <= tolerance and views >= min_views
-    return possible
+        for part in range(8):
+            i, j, k = 2 * cells[n, 0] + (part >> 2), 2 * cells[n, 1] + ((part >> 1) & 1), 2 * cells[n, 2] + (part & 1)
+            x, y, z = origin[0] + (i + 0.5) * edge, origin[1] + (j + 0.5) * edge, origin[2] + (k + 0.5) * edge
+            against, views = 0, 0
+            for c in range(P.shape[0]):
+                answer = classify(P, size, subject, seen, unseen, c, x, y, z, half, half, half)
+                views += answer != UNSEEN
+                against += answer == BACKGROUND
+                if against > tolerance:
+                    break
+            if against <= tolerance and views >= min_views:
+                parts[count, 0], parts[count, 1], parts[count, 2] = i, j, k
+                count += 1
+    return parts[:count].copy()

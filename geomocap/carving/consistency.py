@@ -64,21 +64,55 @@ def camera_gains(seen: VoxelVisibility, samples: int = 2000) -> np.ndarray:
 
     The median over voxels that three or more cameras see of (median colour of the cameras / this camera's colour).
     """
-    several = np.flatnonzero(seen.seen.sum(axis=1) >= 3)
+    several = np.flatnonzero(_sums(seen.seen) >= 3)
     several = several[:: max(1, len(several) // samples)]
     C = seen.seen.shape[1]
     gains = np.ones((C, 3), np.float32)
     if len(several) < 50:
         return gains
-    colors = np.where(seen.seen[several, :, None] != 0, seen.colors[several], np.inf)
-    ordered, count = np.sort(colors, axis=1), seen.seen[several].sum(axis=1, dtype=np.int64)
-    row = np.arange(len(several))
-    middle = (ordered[row, (count - 1) // 2] + ordered[row, count // 2]) / 2
+    sees, colors = seen.seen[several], seen.colors[several]
+    middle = _middle_colors(sees, colors)
     for c in range(C):
-        usable = (seen.seen[several, c] != 0) & (colors[:, c].min(axis=1) > 16)
+        usable = (sees[:, c] != 0) & (colors[:, c] > 16).all(axis=1)
         if usable.sum() >= 50:
             gains[c] = np.clip(np.median(middle[usable] / colors[usable, c], axis=0), 0.5, 2.0)
     return gains
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sums(seen):
+    """How many cameras see each voxel, (N,) int64."""
+    sums = np.zeros(len(seen), np.int64)
+    for n in range(seen.shape[0]):
+        for c in range(seen.shape[1]):
+            sums[n] += seen[n, c]
+    return sums
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _middle_colors(seen, colors):
+    """Median colour of the cameras that see each voxel, (N, 3) float32; there is one at least."""
+    N, C = seen.shape
+    middle, values = np.empty((N, 3), np.float32), np.empty(C, np.float32)
+    for n in range(N):
+        for a in range(3):
+            count = 0
+            for c in range(C):
+                if seen[n, c]:
+                    count = _insert(colors[n, c, a], values, count)
+            middle[n, a] = np.float32(0.5) * (values[(count - 1) // 2] + values[count // 2])
+    return middle
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _insert(value, values, count):
+    """Insert a value into the sorted first few; return how many there are then."""
+    at = count
+    while at > 0 and values[at - 1] > value:
+        values[at] = values[at - 1]
+        at -= 1
+    values[at] = value
+    return count + 1
 
 
 def color_deviation(seen: VoxelVisibility, gains: np.ndarray, min_cameras: int) -> np.ndarray:
@@ -102,14 +136,7 @@ def _deviate(seen, colors, low, high, gains, min_cameras, out):
             count = 0
             for c in range(C):
                 if seen[n, c]:
-                    # insertion sort: few values
-                    value = colors[n, c, a] * gains[c, a]
-                    at = count
-                    while at > 0 and values[at - 1] > value:
-                        values[at] = values[at - 1]
-                        at -= 1
-                    values[at] = value
-                    count += 1
+                    count = _insert(colors[n, c, a] * gains[c, a], values, count)
             if count < min_cameras:
                 break
             middle = np.float32(0.5) * (values[(count - 1) // 2] + values[count // 2])
@@ -126,13 +153,15 @@ def _deviate(seen, colors, low, high, gains, min_cameras, out):
 def _near(changed, surface):
     """Mark the surface voxels within a word or so of a change; what is farther away is not judged again."""
     X, Y, K = changed.shape
-    near = np.zeros(len(surface), np.bool_)
+    around = np.zeros_like(changed)
+    for i in range(X):
+        for j in range(Y):
+            for k in range(K):
+                if changed[i, j, k]:
+                    around[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2, max(k - 1, 0) : k + 2] = True
+    near = np.empty(len(surface), np.bool_)
     for n in range(len(surface)):
-        i, j, k = surface[n, 0], surface[n, 1], surface[n, 2] >> 5
-        for a in range(max(i - 1, 0), min(i + 2, X)):
-            for b in range(max(j - 1, 0), min(j + 2, Y)):
-                for c in range(max(k - 1, 0), min(k + 2, K)):
-                    near[n] |= changed[a, b, c]
+        near[n] = around[surface[n, 0], surface[n, 1], surface[n, 2] >> 5]
     return near
 
 
@@ -154,7 +183,7 @@ def _judge(voxels, deviation, threshold, judged, bad):
 def _take(bits, surface, support, judged, bad, changed):
     """Take from `bits` the inconsistent voxels whose surroundings (5³) are inconsistent too; return how many."""
     X, Y, K = bits.shape
-    taken = 0
+    gone, taken = np.empty(len(surface), np.int64), 0
     for n in range(len(surface)):
         i, j, k = surface[n, 0], surface[n, 1], surface[n, 2]
         bit = np.uint32(1 << (k & 31))
@@ -171,11 +200,11 @@ def _take(bits, surface, support, judged, bad, changed):
         if n_bad >= support * n_judged:
             bits[i, j, k >> 5] &= ~bit
             changed[i, j, k >> 5] = True
+            gone[taken] = n
             taken += 1
-    for n in range(len(surface)):  # what is gone no longer counts for its neighbours
+    for n in gone[:taken]:  # what is gone no longer counts for its neighbours
         i, j, k = surface[n, 0], surface[n, 1], surface[n, 2]
         bit = np.uint32(1 << (k & 31))
-        if not bits[i, j, k >> 5] & bit:
-            judged[i, j, k >> 5] &= ~bit
-            bad[i, j, k >> 5] &= ~bit
+        judged[i, j, k >> 5] &= ~bit
+        bad[i, j, k >> 5] &= ~bit
     return taken

@@ -143,14 +143,13 @@ def _indices(bits, counts):
         for j in range(Y):
             for k in range(K):
                 word = bits[i, j, k]
-                if word == 0:
-                    continue
-                for b in range(32):
-                    if (word >> np.uint32(b)) & np.uint32(1):
-                        out[n, 0] = i
-                        out[n, 1] = j
-                        out[n, 2] = 32 * k + b
-                        n += 1
+                while word != 0:
+                    rest = np.uint32(word & np.uint32(word - np.uint32(1)))  # without the lowest bit
+                    out[n, 0] = i
+                    out[n, 1] = j
+                    out[n, 2] = 32 * k + _popcount((word ^ rest) - np.uint32(1))
+                    n += 1
+                    word = rest
     return out
 
 

@@ -81,8 +81,10 @@ class PinholeViews:
         cut = np.zeros(len(self), bool)
         window = np.ones((2 * BORDER + 1,) * 2, np.uint8)
         for c, (mask, valid) in enumerate(zip(self.masks, self.valid, strict=True)):
-            within = cv2.erode(valid, window, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-            cut[c] = np.count_nonzero(mask & (valid ^ within)) >= LEAST_CUT
+            x, y, w, h = cv2.boundingRect(mask)
+            part = slice(max(0, y - BORDER), y + h + BORDER), slice(max(0, x - BORDER), x + w + BORDER)
+            within = cv2.erode(valid[part], window, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+            cut[c] = np.count_nonzero(mask[part] & (valid[part] ^ within)) >= LEAST_CUT
         return cut
 
     def blind(self) -> np.ndarray:

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from numba import njit
 
-from geomocap.carving.block_kernels import possible, summed
+from geomocap.carving.block_kernels import possible_parts, summed
 from geomocap.carving.carving_settings import HullSettings
 from geomocap.carving.hull import heard, rounding_bounds
 from geomocap.carving.silhouette_views import PinholeViews
@@ -86,11 +85,9 @@ def halve(
 ) -> np.ndarray:
     """Divide cells of size `edge` into eight each and return those that may hold a point of the hull, (M, 3) int64."""
     subject, seen, unseen, least = tables
-    parts = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-    children = (2 * cells[:, None] + parts).reshape(-1, 3)
-    high = origin + (children.max(axis=0) + 1) * (edge / 2)
+    high = origin + (cells.max(axis=0) + 1) * edge
     space = Grid(origin, float((high - origin).max()), (1, 1, 1))
-    keep = possible(
+    return possible_parts(
         views.projections,
         rounding_bounds(views, space),
         subject,
@@ -100,9 +97,8 @@ def halve(
         least,
         origin,
         edge / 2,
-        children,
+        cells,
     )
-    return children[keep]
 
 
 def _tables(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
@@ -113,21 +109,59 @@ def _tables(views: PinholeViews, settings: HullSettings) -> tuple[np.ndarray, np
 
 
 def _connected(cells: np.ndarray) -> np.ndarray:
-    """Number the connected parts (26 neighbours) of cells (N, 3): labels (N,) int."""
+    """Number the connected parts (26 neighbours) of different cells (N, 3), all at least 0: labels (N,) int64."""
     side = np.int64(cells.max() + 3)
     keys = ((cells[:, 0] + 1) * side + cells[:, 1] + 1) * side + cells[:, 2] + 1
     order = np.argsort(keys)
-    keys = keys[order]
-    rows, columns = [], []
-    for step in ((a * side + b) * side + c for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1)):
-        if step > 0:
-            at = np.minimum(np.searchsorted(keys, keys + step), len(keys) - 1)
-            linked = np.flatnonzero(keys[at] == keys + step)
-            rows.append(order[linked])
-            columns.append(order[at[linked]])
-    row, column = np.concatenate(rows), np.concatenate(columns)
-    graph = coo_array((np.ones(len(row), np.int8), (row, column)), shape=(len(keys), len(keys)))
-    return connected_components(graph, directed=False)[1]
+    return connected_keys(keys[order], order, side)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def connected_keys(keys, order, side):
+    """Number the connected parts of cells by their keys; parts are counted by their first cell.
+
+    Parameters
+    ----------
+    keys : (N,) int64
+        x · side² + y · side + z of each cell, ascending; no coordinate is 0 or side - 1.
+    order : (N,) int64
+        Number of each of these cells.
+    side : int
+
+    Returns
+    -------
+    (N,) int64
+        Label of each cell, by its number.
+    """
+    first = np.arange(len(keys))  # of each cell, one of its part with a lower number or itself: a forest
+    for a in range(-1, 2):
+        for b in range(-1, 2):
+            for c in range(-1, 2):
+                step, at = (a * side + b) * side + c, 0
+                if step <= 0:
+                    continue
+                for n in range(len(keys)):
+                    while at < len(keys) and keys[at] < keys[n] + step:
+                        at += 1
+                    if at < len(keys) and keys[at] == keys[n] + step:
+                        i, j = _root(first, order[n]), _root(first, order[at])
+                        first[max(i, j)] = min(i, j)
+    labels, count = np.empty(len(keys), np.int64), 0
+    for n in range(len(keys)):
+        if first[n] == n:
+            labels[n], count = count, count + 1
+        else:
+            labels[n] = labels[first[n]]
+    return labels
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _root(first, n):
+    """Find the first cell of a part, halving the way to it."""
+    while first[n] != n:
+        first[n] = first[first[n]]
+        n = first[n]
+    return n
 
 
 def space_seen(views: PinholeViews) -> tuple[np.ndarray, float]:

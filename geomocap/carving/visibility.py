@@ -15,6 +15,7 @@ from geomocap.carving.occupancy import Occupancy
 from geomocap.carving.silhouette_views import PinholeViews
 from geomocap.carving.voxel_grid import Grid
 
+TOGETHER = 256  # voxels that all cameras look at before the next ones
 DEPTH_SLACK = 1.5  # voxels that something must lie before a centre to hide it: a slanted surface doesn't hide itself
 
 
@@ -136,16 +137,25 @@ def _centers(P: np.ndarray) -> np.ndarray:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _free_faces(bits, surface):
     X, Y, K = bits.shape
-    steps = ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))
+    none = np.uint32(0)
+    around = np.zeros(6, np.uint32)  # of a word's voxels, which neighbours are occupied
+    last_i, last_j, last_w = -1, -1, -1
     faces = np.zeros(len(surface), np.uint8)
     for n in range(len(surface)):
-        free = 0
+        i, j, w = surface[n, 0], surface[n, 1], surface[n, 2] >> 5
+        if i != last_i or j != last_j or w != last_w:
+            last_i, last_j, last_w = i, j, w
+            word = bits[i, j, w]
+            around[0] = bits[i - 1, j, w] if i > 0 else none
+            around[1] = bits[i + 1, j, w] if i < X - 1 else none
+            around[2] = bits[i, j - 1, w] if j > 0 else none
+            around[3] = bits[i, j + 1, w] if j < Y - 1 else none
+            around[4] = word << np.uint32(1) | (bits[i, j, w - 1] >> np.uint32(31) if w > 0 else none)
+            around[5] = word >> np.uint32(1) | (bits[i, j, w + 1] << np.uint32(31) if w < K - 1 else none)
+        bit, occupied = np.uint32(surface[n, 2] & 31), np.uint32(0)
         for f in range(6):
-            i, j, k = surface[n, 0] + steps[f][0], surface[n, 1] + steps[f][1], surface[n, 2] + steps[f][2]
-            inside = 0 <= i < X and 0 <= j < Y and 0 <= k < 32 * K
-            if not inside or not (bits[i, j, k >> 5] >> np.uint32(k & 31)) & np.uint32(1):
-                free |= 1 << f
-        faces[n] = free
+            occupied |= ((around[f] >> bit) & np.uint32(1)) << np.uint32(f)
+        faces[n] = ~occupied & np.uint32(63)
     return faces
 
 
@@ -158,21 +168,29 @@ def _faces_camera(faces, dx, dy, dz, half):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _places(surface, origin, edge):
+    """Centres of voxels, (3, N) float64, metres."""
+    places = np.empty((3, len(surface)))
+    for a in range(3):
+        for n in range(len(surface)):
+            places[a, n] = origin[a] + (surface[n, a] + 0.5) * edge
+    return places
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _draw(P, centers, surface, faces, origin, edge, depth):
     C, N = len(depth), len(surface)
-    places = np.empty((3, N))
-    for a in range(3):
-        for n in range(N):
-            places[a, n] = origin[a] + (surface[n, a] + 0.5) * edge
+    places = _places(surface, origin, edge)
     box, near = np.empty((4, N), np.int32), np.empty(N, np.float32)
     for c in range(C):
         _project_cubes(P[c], centers[c], places, faces, 0.5 * edge, depth.shape[1:], box, near)
+        flat, width = depth[c].ravel(), depth.shape[2]
         for n in range(N):
             d = near[n]
             for row in range(box[2, n], box[3, n] + 1):
                 for column in range(box[0, n], box[1, n] + 1):
-                    if d < depth[c, row, column]:
-                        depth[c, row, column] = d
+                    at = np.uint32(row * width + column)
+                    flat[at] = min(flat[at], d)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -210,55 +228,86 @@ def _project_cubes(P, center, places, faces, half, size, box, near):
 def _look(
     P, centers, masks, valid, images, depth, surface, faces, origin, edge, slack, window, seen, colors, low, high
 ):
-    C, H, W = masks.shape
-    half = 0.5 * edge
-    reaches = half * np.sqrt(P[:, 0, 0] ** 2 + P[:, 0, 1] ** 2 + P[:, 0, 2] ** 2)  # half a voxel's, at a metre, pixels
-    for n in range(len(surface)):
-        x = origin[0] + (surface[n, 0] + 0.5) * edge
-        y = origin[1] + (surface[n, 1] + 0.5) * edge
-        z = origin[2] + (surface[n, 2] + 0.5) * edge
+    C, N = len(masks), len(surface)
+    places = _places(surface, origin, edge)
+    pixel, point = np.empty(TOGETHER, np.int32), np.empty((3, TOGETHER))
+    for begin in range(0, N, TOGETHER):  # what is written of so many stays in the cache
+        part = slice(begin, min(begin + TOGETHER, N))
         for c in range(C):
-            if not _faces_camera(faces[n], centers[c, 0] - x, centers[c, 1] - y, centers[c, 2] - z, half):
-                continue
-            w = P[c, 2, 0] * x + P[c, 2, 1] * y + P[c, 2, 2] * z + P[c, 2, 3]
-            if w <= edge:
-                continue
-            u = (P[c, 0, 0] * x + P[c, 0, 1] * y + P[c, 0, 2] * z + P[c, 0, 3]) / w
-            v = (P[c, 1, 0] * x + P[c, 1, 1] * y + P[c, 1, 2] * z + P[c, 1, 3]) / w
-            if not (u >= 0 and v >= 0 and u < W and v < H):
-                continue
-            iu, iv = int(u), int(v)
-            if valid[c, iv, iu] == 0 or w > depth[c, iv, iu] + slack:
-                continue
-            seen[n, c] = 1
-            # mean colour under the voxel's own square, range of colours in the window
-            reach = min(reaches[c] / w, 4.0)
-            own_u0, own_u1 = int(np.floor(u - reach)), int(np.floor(u + reach))
-            own_v0, own_v1 = int(np.floor(v - reach)), int(np.floor(v + reach))
-            r = g = b = 0
-            count = 0
-            r0 = g0 = b0 = np.uint8(255)
-            r1 = g1 = b1 = np.uint8(0)
-            u0, u1 = max(min(iu - window, own_u0), 0), min(max(iu + window, own_u1), W - 1)
-            v0, v1 = max(min(iv - window, own_v0), 0), min(max(iv + window, own_v1), H - 1)
-            for row in range(v0, v1 + 1):
-                for column in range(u0, u1 + 1):
-                    if masks[c, row, column] == 0 and not (row == iv and column == iu):
-                        continue
-                    red, green, blue = images[c, row, column, 0], images[c, row, column, 1], images[c, row, column, 2]
-                    r0, r1 = min(r0, red), max(r1, red)
-                    g0, g1 = min(g0, green), max(g1, green)
-                    b0, b1 = min(b0, blue), max(b1, blue)
-                    if own_v0 <= row <= own_v1 and own_u0 <= column <= own_u1:
-                        r += red
-                        g += green
-                        b += blue
-                        count += 1
-            colors[n, c, 0] = r / count
-            colors[n, c, 1] = g / count
-            colors[n, c, 2] = b / count
-            low[n, c, 0], low[n, c, 1], low[n, c, 2] = r0, g0, b0
-            high[n, c, 0], high[n, c, 1], high[n, c, 2] = r1, g1, b1
+            _project_centers(P[c], centers[c], places[:, part], faces[part], edge, masks.shape[1:], pixel, point)
+            half = 0.5 * edge * np.sqrt(P[c, 0, 0] ** 2 + P[c, 0, 1] ** 2 + P[c, 0, 2] ** 2)  # at a metre, pixels
+            _look_from(
+                masks[c], valid[c], images[c], depth[c], pixel, point, half, slack, window,
+                seen[part, c], colors[part, c], low[part, c], high[part, c],
+            )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _look_from(mask, valid, image, depth, pixel, point, half, slack, window, seen, colors, low, high):
+    """Fill in what one camera sees of some voxels, from `_project_centers`."""
+    H, W = np.int64(mask.shape[0]), np.int64(mask.shape[1])
+    subject, see, nearest, grey = mask.ravel(), valid.ravel(), depth.ravel(), image.ravel()
+    for n in range(seen.size):
+        if pixel[n] < 0:
+            continue
+        center, u, v, w = np.uint32(pixel[n]), point[0, n], point[1, n], point[2, n]
+        if see[center] == 0 or w > nearest[center] + slack:
+            continue
+        seen[n] = 1
+        # mean colour under the voxel's own square, range of colours in the window
+        iu, iv = np.int64(u), np.int64(v)
+        reach = min(half / w, 4.0)
+        own_u0, own_u1 = np.int64(np.floor(u - reach)), np.int64(np.floor(u + reach))
+        own_v0, own_v1 = np.int64(np.floor(v - reach)), np.int64(np.floor(v + reach))
+        r = g = b = 0
+        count = 0
+        r0 = g0 = b0 = np.uint8(255)
+        r1 = g1 = b1 = np.uint8(0)
+        u0, u1 = max(min(iu - window, own_u0), 0), min(max(iu + window, own_u1), W - 1)
+        v0, v1 = max(min(iv - window, own_v0), 0), min(max(iv + window, own_v1), H - 1)
+        for row in range(v0, v1 + 1):
+            for column in range(u0, u1 + 1):
+                at = np.uint32(row * W + column)
+                if subject[at] == 0 and at != center:
+                    continue
+                place = np.uint32(3) * at
+                red, green, blue = grey[place], grey[place + np.uint32(1)], grey[place + np.uint32(2)]
+                r0, r1 = min(r0, red), max(r1, red)
+                g0, g1 = min(g0, green), max(g1, green)
+                b0, b1 = min(b0, blue), max(b1, blue)
+                if own_v0 <= row <= own_v1 and own_u0 <= column <= own_u1:
+                    r += red
+                    g += green
+                    b += blue
+                    count += 1
+        colors[n, 0], colors[n, 1], colors[n, 2] = r / count, g / count, b / count
+        low[n, 0], low[n, 1], low[n, 2] = r0, g0, b0
+        high[n, 0], high[n, 1], high[n, 2] = r1, g1, b1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _project_centers(P, center, places, faces, edge, size, pixel, point):
+    """Project the voxels' centres into an image: pixel (row · width + column), and its coordinates and depth.
+
+    The pixel is -1 outside of the image, before the camera, and where no free face is turned to the camera. Without
+    branches, as `_project_cubes`.
+    """
+    H, W = np.float64(size[0]), np.float64(size[1])
+    p00, p01, p02, p03 = P[0, 0], P[0, 1], P[0, 2], P[0, 3]
+    p10, p11, p12, p13 = P[1, 0], P[1, 1], P[1, 2], P[1, 3]
+    p20, p21, p22, p23 = P[2, 0], P[2, 1], P[2, 2], P[2, 3]
+    xs, ys, zs = places[0], places[1], places[2]
+    us, vs, ws = point[0], point[1], point[2]
+    for n in range(faces.size):
+        x, y, z = xs[n], ys[n], zs[n]
+        w = p20 * x + p21 * y + p22 * z + p23
+        u = (p00 * x + p01 * y + p02 * z + p03) / w
+        v = (p10 * x + p11 * y + p12 * z + p13) / w
+        inside = _faces_camera(faces[n], center[0] - x, center[1] - y, center[2] - z, 0.5 * edge) & (w > edge)
+        inside &= (u >= 0) & (v >= 0) & (u < W) & (v < H)
+        at = np.int32(v) * np.int32(size[1]) + np.int32(u)
+        pixel[n] = at if inside else np.int32(-1)
+        us[n], vs[n], ws[n] = u, v, w
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

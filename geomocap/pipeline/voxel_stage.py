@@ -89,8 +89,9 @@ class _Carve:
 
     def __call__(self, frame: int) -> None:
         assert self.grid is not None
-        images = None
+        views, images = self.checked_views(frame), None
         if self.capture.has_images and needs_images(self.settings):
-            images = self.undistortion.images([self.capture.frame(c, frame) for c in self.capture.cameras])
-        found = carve_frame(self.checked_views(frame), self.grid, self.settings, images, frame)
+            within = views if self.settings.hull.tolerance == 0 else None  # every voxel is in all silhouettes
+            images = self.undistortion.images([self.capture.frame(c, frame) for c in self.capture.cameras], within)
+        found = carve_frame(views, self.grid, self.settings, images, frame)
         write_voxels(self.run.frame_file("voxels", frame), found)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from geomocap.carving.agreement import (
     check_agreement,
@@ -14,11 +15,12 @@ from geomocap.carving.agreement import (
     check_silhouettes,
     silhouette_coverage,
 )
+from geomocap.carving.block_kernels import possible_parts, summed
 from geomocap.carving.carving_settings import CarvingSettings, HullSettings
 from geomocap.carving.frames import carve_frame
-from geomocap.carving.hull import hull_surface, visual_hull
+from geomocap.carving.hull import heard, hull, hull_surface, rounding_bounds, visual_hull
 from geomocap.carving.silhouette_views import PinholeViews
-from geomocap.carving.subject_bounds import subject_box
+from geomocap.carving.subject_bounds import connected_keys, subject_box
 from geomocap.carving.volume import working_volume
 from geomocap.carving.voxel_grid import Grid
 from geomocap.errors import CalibrationError, GeometryError
@@ -247,3 +249,36 @@ def test_a_frame_that_leaves_much_room_doesnt_make_all_frames_coarse():
     alone, together = (working_volume(frames, settings) for frames in ([whole] * 3, [whole, whole, bulky]))
     assert together.voxel_size == pytest.approx(1.5 * alone.voxel_size)
     assert (together.low <= low + 1e-9).all() and (together.high >= high - 1e-9).all()
+
+
+@pytest.mark.parametrize(("count", "size"), [(1, 3), (40, 8), (900, 14), (2000, 40)])
+def test_connected_cells_are_those_of_labelled_images(count, size):
+    rng = np.random.default_rng(count)
+    cells = np.unique(rng.integers(0, size, (count, 3)), axis=0)
+    cells = cells[rng.permutation(len(cells))]
+    dense = np.zeros((size, size, size), bool)
+    dense[tuple(cells.T)] = True
+    expected = ndimage.label(dense, np.ones((3, 3, 3)))[0][tuple(cells.T)]
+    keys = (cells + 1) @ [(size + 2) ** 2, size + 2, 1]
+    order = np.argsort(keys)
+    labels = connected_keys(keys[order], order, size + 2)
+    _, first = np.unique(expected, return_index=True)
+    np.testing.assert_array_equal(labels, np.searchsorted(np.sort(first), first)[expected - 1])
+
+
+def test_parts_of_cells_are_those_that_all_cameras_may_see():
+    P = ring(8)
+    views, cells = figure(P), np.array([[0, 0, 0], [1, 1, 1], [0, 1, 1]])
+    origin, edge = np.array([-1.0, -1.0, -0.2]), 1.0
+    heeded, unseen, least = heard(views, HullSettings())
+    subject = summed(heeded.masks)
+    space = Grid(origin, 2.0, (1, 1, 1))
+    found = possible_parts(
+        P, rounding_bounds(views, space), subject, summed(heeded.valid), unseen, 0, least, origin, edge / 2, cells
+    )
+    dense = hull(views, Grid(origin, edge / 16, (32, 32, 32))).dense()
+    blocks = dense.reshape(4, 8, 4, 8, 4, 8).max(axis=(1, 3, 5))
+    kept = {tuple(part) for part in found.tolist()}
+    inside = {tuple(c) for c in np.argwhere(blocks).tolist() if [n // 2 for n in c] in cells.tolist()}
+    assert inside <= kept < {tuple((2 * c + [i, j, k]).tolist()) for c in cells for i, j, k in np.ndindex(2, 2, 2)}
+    assert found.tolist() == [[*c] for cell in cells for c in sorted(kept) if [n // 2 for n in c] == cell.tolist()]
