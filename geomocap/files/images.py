@@ -23,6 +23,10 @@ from geomocap.reading import open_plain, read_bytes
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
 MOST_SIDE = 16384  # pixels of an image that is made
 _DEPTHS = (8, 10, 12, 14, 16)  # bits that cameras use of 16
+_FAST = (
+    *(cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_FIXED),
+    *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE),
+)
 _LOOKED_AT = 5  # frames of a camera that tell how many it uses
 
 
@@ -70,8 +74,7 @@ def write_image(path: Path, image: np.ndarray, parameters: Sequence[int] = ()) -
 
 def write_mask(path: Path, mask: np.ndarray) -> None:
     """Write a silhouette (H, W) uint8 as a PNG that is made for speed, whole or not at all."""
-    fast = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
-    write_image(path, mask, fast)
+    write_image(path, mask, _FAST)
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from itertools import product
-
 import numpy as np
-from scipy.sparse import csr_matrix
+from numba import njit
 
 
 def count_contacts(points: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
@@ -34,16 +32,29 @@ def count_contacts(points: np.ndarray, labels: np.ndarray, count: int) -> np.nda
     cells = np.floor(points - points.min(axis=0) + 0.5).astype(np.int64) + 1
     shape = cells.max(axis=0) + 2
     strides = np.array([shape[1] * shape[2], shape[2], 1])
-    keys, cell = np.unique(cells[known] @ strides, return_inverse=True)
-    held = csr_matrix((np.ones(len(cell), np.int32), (cell, labels[known])), shape=(len(keys), count))
-    contacts = (held.T @ held).toarray()
-    for way in product((0, 1), (-1, 0, 1), (-1, 0, 1)):
-        if way > (0, 0, 0):  # each two cells once
-            step = way @ strides
-            beside = np.searchsorted(keys, keys + step) % len(keys)
-            one = np.flatnonzero(keys[beside] == keys + step)
-            between = (held[one].T @ held[beside[one]]).toarray()
-            contacts += between + between.T
+    keys = cells[known] @ strides
+    order = np.argsort(keys, kind="stable")
+    return _count_neighbours(keys[order], labels[known][order], strides, count)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_neighbours(keys, labels, strides, count):
+    """Count the neighbouring pairs of points by their labels, from the keys of their cells (N,), ascending."""
+    contacts = np.zeros((count, count), np.int32)
+    for a in range(2):
+        for b in range(-1, 2):
+            for c in range(-1, 2):
+                step, first = a * strides[0] + b * strides[1] + c * strides[2], 0
+                if step < 0:
+                    continue  # each two cells once
+                for n in range(len(keys)):
+                    while first < len(keys) and keys[first] < keys[n] + step:
+                        first += 1
+                    at = first if step > 0 else n + 1  # a point's own cell, too
+                    while at < len(keys) and keys[at] == keys[n] + step:
+                        contacts[labels[n], labels[at]] += 1
+                        contacts[labels[at], labels[n]] += 1
+                        at += 1
     np.fill_diagonal(contacts, 0)
     return contacts
 

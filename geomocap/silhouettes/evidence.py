@@ -7,7 +7,7 @@ from numba import njit
 
 SMOOTHING = 3.0  # reach of the vote, pixels
 EDGE = 12.0  # colour step that stops it, noise sigmas
-BAND = 64  # rows that are smoothed along x at once
+BAND = 16  # rows that are smoothed along x at once
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -62,25 +62,21 @@ def smooth_evidence(evidence, image, sigma):
     (H, W) float32
     """
     h, w = evidence.shape
-    out = evidence.copy()
     bands = (h + BAND - 1) // BAND
     right = np.zeros((bands, w, BAND), np.float32)  # weights across the border to the next pixel, columns before rows
     down = np.zeros((h, w), np.float32)
     _edge_weights(image, sigma, right, down)
+    out = evidence.copy()
     columns = np.zeros((w, BAND), np.float32)
     for k in range(2):
         # Rounds with standard deviations that add up to the reach: sigma sqrt(3) 2^(N-1-k) / sqrt(4^N - 1), N = 2.
         a = np.float32(np.exp(-np.sqrt(2.0) / (SMOOTHING * np.sqrt(3.0) * 2.0 ** (1 - k) / np.sqrt(15.0))))
         for band in range(bands):
-            top = band * BAND
-            rows = out[top : min(top + BAND, h)]
+            rows = out[band * BAND : (band + 1) * BAND]
             for y in range(rows.shape[0]):
                 for x in range(w):
                     columns[x, y] = rows[y, x]
-            for x in range(1, w):
-                _vote(columns[x], columns[x - 1], right[band, x - 1], a)
-            for x in range(w - 2, -1, -1):
-                _vote(columns[x], columns[x + 1], right[band, x], a)
+            _vote_along(columns, right[band], a)
             for y in range(rows.shape[0]):
                 for x in range(w):
                     rows[y, x] = columns[x, y]
@@ -89,6 +85,20 @@ def smooth_evidence(evidence, image, sigma):
         for y in range(h - 2, -1, -1):
             _vote(out[y], out[y + 1], down[y], a)
     return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _vote_along(columns, weights, a):
+    """Let each of some columns (N, BAND) vote on the next one, then on the one before."""
+    band, last = np.uint64(BAND), np.uint64(columns.size - BAND)
+    values, weight = columns.ravel(), weights.ravel()
+    for begin in range(np.uint64(0), last, band):
+        for n in range(begin, begin + band):
+            values[n + band] += a * weight[n] * (values[n] - values[n + band])
+    for end in range(np.uint64(0), last, band):
+        first = last - band - end
+        for n in range(first, first + band):
+            values[n] += a * weight[n] * (values[n + band] - values[n])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -102,20 +112,24 @@ def _vote(own, theirs, weights, a):
 def _edge_weights(image, sigma, right, down):
     """Fill in the weights to the pixels on the right, (H / BAND, W, BAND), and below, (H, W)."""
     h, w = sigma.shape
-    edge = np.float32(EDGE)
-    one = np.float32(1.0)
+    step, weights = np.zeros(3 * w, np.float32), np.zeros(w, np.float32)
     for y in range(h):
-        for x in range(w):
-            scale = one / (edge * edge * sigma[y, x] * sigma[y, x])
-            if x + 1 < w:
-                r = np.float32(0.0)
-                for c in range(3):
-                    r += (np.float32(image[y, x + 1, c]) - np.float32(image[y, x, c])) ** 2
-                r = one + r * scale
-                right[y // BAND, x, y % BAND] = one / (r * r)
-            if y + 1 < h:
-                d = np.float32(0.0)
-                for c in range(3):
-                    d += (np.float32(image[y + 1, x, c]) - np.float32(image[y, x, c])) ** 2
-                d = one + d * scale
-                down[y, x] = one / (d * d)
+        row = image[y].ravel()
+        _weigh(row[3:], row[:-3], sigma[y], step, weights[: w - 1])
+        for x in range(w - 1):
+            right[y // BAND, x, y % BAND] = weights[x]
+        if y + 1 < h:
+            _weigh(image[y + 1].ravel(), row, sigma[y], step, down[y])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _weigh(colors, others, sigma, step, weights):
+    """Fill in weights (N,) that fall with the step from one row of colours (3 N,) uint8 to another; `step` is room."""
+    edge, one = np.float32(EDGE), np.float32(1.0)
+    for n in range(colors.size):
+        difference = np.int32(colors[n]) - np.int32(others[n])
+        step[n] = np.float32(np.int32(difference * difference))
+    for x in range(weights.size):
+        scale = one / (edge * edge * sigma[x] * sigma[x])
+        r = one + (step[3 * x] + step[3 * x + 1] + step[3 * x + 2]) * scale
+        weights[x] = one / (r * r)
