@@ -181,14 +181,23 @@ def _places(surface, origin, edge):
 def _draw(P, centers, surface, faces, origin, edge, depth):
     C, N = len(depth), len(surface)
     places = _places(surface, origin, edge)
-    box, near = np.empty((4, N), np.int32), np.empty(N, np.float32)
+    box, near, drawn = np.empty((4, N), np.int32), np.empty(N, np.float32), np.empty(N, np.uint32)
     for c in range(C):
         _project_cubes(P[c], centers[c], places, faces, 0.5 * edge, depth.shape[1:], box, near)
         flat, width = depth[c].ravel(), depth.shape[2]
+        left, right, top, bottom = box[0], box[1], box[2], box[3]
+        count = 0
         for n in range(N):
+            drawn[count] = n
+            count += bottom[n] >= 0
+        for n in drawn[:count]:
             d = near[n]
-            for row in range(box[2, n], box[3, n] + 1):
-                for column in range(box[0, n], box[1, n] + 1):
+            if left[n] == right[n] and top[n] == bottom[n]:  # nearly all where voxels are as small as pixels
+                at = np.uint32(top[n] * width + left[n])
+                flat[at] = min(flat[at], d)
+                continue
+            for row in range(top[n], bottom[n] + 1):
+                for column in range(left[n], right[n] + 1):
                     at = np.uint32(row * width + column)
                     flat[at] = min(flat[at], d)
 

@@ -89,7 +89,7 @@ class CameraEvidence:
         misfit = background_misfit(image, *about, *light)
         shade = np.full(misfit.shape, np.inf, np.float32)
         if settings.shadows and shadows:
-            shade = shadow_misfit(misfit, image, *about, *light, settings.shadow_darkest)
+            shade = shadow_misfit(misfit, image, *about, *light, settings.shadow_darkest, SHADED)
         return cls(image, model, light, misfit, shade, region)
 
 

@@ -15,7 +15,7 @@ RING = 8  # rows that are kept at once; a power of two beyond the height of two 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def shadow_misfit(direct, image, mean, sigma, known, gain, offset, darkest):
+def shadow_misfit(direct, image, mean, sigma, known, gain, offset, darkest, limit):
     """Compare each pixel with the background under a shadow or reflection, where the lit background doesn't explain it.
 
     A window's shadow is a factor on the background that varies linearly in it (penumbra), by least squares. It explains
@@ -32,14 +32,17 @@ def shadow_misfit(direct, image, mean, sigma, known, gain, offset, darkest):
         As in `background_misfit`.
     darkest : float
         Least factor of a shadow.
+    limit : float
+        Misfit from which a shadow explains nothing.
 
     Returns
     -------
     (H, W) float32
-        Half the chi-square of colour, texture and hue; infinite where no shadow is possible or asked for.
+        Half the chi-square of colour, texture and hue; infinite from the limit on and where no shadow is possible or
+        asked for.
     """
     h, w = known.shape
-    darkest = np.float64(darkest)
+    darkest, most = np.float64(darkest), np.float32(2.0 * limit)
     radius, lightest, color = SHADOW_RADIUS, SHADOW_LIGHTEST, SHADOW_COLOR
     result = np.full((h, w), np.float32(np.inf), np.float32)
     # Row y of the image is kept in row y modulo RING of these, between borders of zeros, until no window needs it
@@ -91,7 +94,7 @@ def shadow_misfit(direct, image, mean, sigma, known, gain, offset, darkest):
             if not possible[y & (RING - 1), x]:
                 continue
             noise = sigma[y, x] * sigma[y, x]
-            least = np.float32(np.inf)
+            least = most
             for v in range(y - radius, y + radius + 1, radius):
                 q = v & (RING - 1)
                 for u in range(x - radius, x + radius + 1, radius):
@@ -104,7 +107,8 @@ def shadow_misfit(direct, image, mean, sigma, known, gain, offset, darkest):
                         left = np.float32(picture[y & (RING - 1), c, x + radius]) - shaded
                         own += left * left / (noise + color * color * shaded * shaded)
                     least = min(least, own)
-            result[y, x] = np.float32(0.5) * least
+            if least < most:
+                result[y, x] = np.float32(0.5) * least
     return result
 
 

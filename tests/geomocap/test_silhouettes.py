@@ -377,9 +377,12 @@ def test_shadow_misfit_is_that_of_the_shaded_background() -> None:
         direct[2, 2] = 20  # one window alone
         one, zero = np.ones(3, np.float32), np.zeros(3, np.float32)
         sigma, known = np.full((5, 5), 1.6, np.float32), np.ones((5, 5), bool)
-        result = shadow_misfit(direct, image, lit, sigma, known, one, zero, 0.4)
+        result = shadow_misfit(direct, image, lit, sigma, known, one, zero, 0.4, 1e6)
         expected = reference_misfit(image, lit.astype(float), 1.6, 0.03) / 2
         assert result[2, 2] == pytest.approx(expected, rel=1e-3, abs=2e-3)
+        for limit in (0.5 * result[2, 2], 2.0 * result[2, 2]):
+            limited = shadow_misfit(direct, image, lit, sigma, known, one, zero, 0.4, limit)
+            np.testing.assert_array_equal(limited, np.where(result < limit, result, np.inf))
         assert np.isinf(result.ravel()[np.arange(25) != 12]).all()
 
 
