@@ -27,17 +27,14 @@ class Alternative:
 
     Attributes
     ----------
+    candidate : Candidate
+        The body, and where its samples go.
     evidence : float
-        What the body explains over what its freedoms cost; below 1 this model is the better one.
-    model : BodyModel
-        The same bodies, of which one has no sample.
-    known : Evidence
-        With places in the reference settled anew.
+        What it explains over what its freedoms cost; below 1 the model without it is the better one.
     """
 
+    candidate: Candidate
     evidence: float
-    model: BodyModel
-    known: Evidence
 
 
 @dataclass(frozen=True)
@@ -91,7 +88,7 @@ def without(candidate: Candidate, model: BodyModel, evidence: Evidence, criterio
             gain = np.maximum(gain, 0.0)
             own = observations
         nats += max(0.5 * observations * float(gain.mean()), 0.0)
-    return Alternative(of_required(nats, own, members, evidence, criterion), left, known)
+    return Alternative(candidate, of_required(nats, own, members, evidence, criterion))
 
 
 def remove(candidate: Candidate, model: BodyModel, evidence: Evidence) -> tuple[BodyModel, Evidence]:

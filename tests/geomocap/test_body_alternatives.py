@@ -38,8 +38,6 @@ def judged(positions, label):
     candidates = judge(range(model.count), model, first.evidence.with_places_open(), criterion)
     beside = np.array([candidates[b].evidence for b in range(model.count)])
     best = [best_alternative(candidates[b], model, first.evidence, criterion) for b in range(model.count)]
-    for body, alternative in enumerate(best):
-        assert not (alternative.model.label == body).any() and not (alternative.model.partner == body).any()
     return beside, np.array([alternative.evidence for alternative in best])
 
 
@@ -52,7 +50,7 @@ def test_half_a_soft_thigh_is_none(leg):
 
 def test_a_soft_thigh_is_one(leg):
     positions, along = leg
-    beside, against = judged(positions, np.digitize(along, [0.4, 0.8]))
+    _, against = judged(positions, np.digitize(along, [0.4, 0.8]))
     assert (against > 1.0).all()
 
 
