@@ -37,7 +37,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geomocap.bodies.body_criterion import Criterion
-from geomocap.bodies.body_joints import Borders, held_together, neighbours_of, parted, parting, shown
+from geomocap.bodies.body_joints import Borders, held_together, motion_known, neighbours_of, parted, parting, shown
 from geomocap.bodies.body_model import BodyModel, Evidence
 from geomocap.bodies.rigid_motions import relative_turn
 from geomocap.bodies.skin_blending import blend_spans
@@ -46,8 +46,6 @@ _FREEDOMS = 3  # of a turn
 _FITTED = 6  # freedoms that were fitted to a body's own samples
 _MOST_SAMPLES = 80
 _MOST_NEIGHBOURS = 7
-_LEAST_SEEN = 0.1
-_LEAST_SAMPLES = 3  # that tell a motion
 TURN_FRACTION = 0.02  # of the frames, in which a turn may be larger
 # Noise turns n samples by three angles, each of variance s²/2 / (n radius²); with the 98th percentile of their χ²:
 _FEIGNED = 9.84 / 2.0
@@ -257,7 +255,7 @@ def _square_radius(places: np.ndarray) -> float:
 
 def _coverage(seen: np.ndarray) -> float:
     """Fraction of a body's samples (n, T) that are seen in a frame in which enough of them are to know its motion."""
-    known = seen.sum(axis=0) >= max(_LEAST_SAMPLES, _LEAST_SEEN * len(seen))
+    known = motion_known(seen)
     return float(seen[:, known].mean()) if known.any() else 0.0
 
 

@@ -125,5 +125,10 @@ def shown(first: int, second: int, model: BodyModel, evidence: Evidence) -> np.n
 
 def _seen(body: int, model: BodyModel, evidence: Evidence) -> np.ndarray:
     """Frames in which enough samples of a body are seen to know its motion, (T,) bool."""
-    seen = evidence.seen[model.label == body]
-    return seen.sum(axis=0) >= max(_LEAST_SAMPLES, _LEAST_SEEN * len(seen))
+    return motion_known(evidence.seen[model.label == body])
+
+
+def motion_known(seen: np.ndarray) -> np.ndarray:
+    """Frames in which enough of a body's samples are seen, (n, T) bool, to know its motion: (T,) bool."""
+    enough: np.ndarray = seen.sum(axis=0) >= max(_LEAST_SAMPLES, _LEAST_SEEN * len(seen))
+    return enough

@@ -16,7 +16,6 @@ from geomocap.silhouettes.background import (
     model_from_frames,
     model_from_plate,
 )
-from geomocap.silhouettes.background_noise import absolute_misses, middle
 from geomocap.silhouettes.evidence import background_misfit, smooth_evidence
 from geomocap.silhouettes.joint_decision import coverage, silhouette
 from geomocap.silhouettes.light import light_change
@@ -156,23 +155,6 @@ def test_frames_that_agree_with_the_plate_are_added_as_in_numpy() -> None:
     assert 0.2 < agrees.mean() < 0.8
     np.testing.assert_array_equal(count, 1 + agrees)
     np.testing.assert_array_equal(total, plate + value * agrees[..., None])
-
-
-def test_misses_are_those_of_the_reference() -> None:
-    rng = np.random.default_rng(4)
-    images, mean = rng.integers(0, 256, (4, 50, 3), dtype=np.uint8), rng.uniform(0, 255, (20, 3)).astype(np.float32)
-    pixels, gains, offsets = rng.choice(50, 20, replace=False), rng.uniform(0.9, 1.1, (4, 3)), rng.normal(size=(4, 3))
-    misses = absolute_misses(images, pixels, mean, gains, offsets)
-    expected = np.abs(images[:, pixels] - (gains[:, None] * mean + offsets[:, None]))
-    np.testing.assert_array_equal(misses, expected.ravel())
-
-
-@pytest.mark.parametrize("n", [1, 2, 7, 1999, 2000, 50_001, 50_002])
-def test_the_middle_is_the_median(n: int) -> None:
-    rng = np.random.default_rng(n)
-    periodic = np.where(np.arange(n) % max(1, n // 1000) == 0, 5.0, np.arange(n))  # the sample tells nothing of it
-    for values in (rng.normal(size=n), rng.integers(0, 3, n).astype(float), periodic):
-        assert middle(values) == np.median(values)
 
 
 def test_noise_is_measured(model: BackgroundModel) -> None:
