@@ -27,14 +27,17 @@ class Alternative:
 
     Attributes
     ----------
-    candidate : Candidate
-        The body, and where its samples go.
     evidence : float
-        What it explains over what its freedoms cost; below 1 the model without it is the better one.
+        What it explains over what its freedoms cost; below 1 this model is the better one.
+    model : BodyModel
+        The same bodies, of which that one has no sample.
+    known : Evidence
+        With places in the reference settled anew.
     """
 
-    candidate: Candidate
     evidence: float
+    model: BodyModel
+    known: Evidence
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,7 @@ def without(candidate: Candidate, model: BodyModel, evidence: Evidence, criterio
             gain = np.maximum(gain, 0.0)
             own = observations
         nats += max(0.5 * observations * float(gain.mean()), 0.0)
-    return Alternative(candidate, of_required(nats, own, members, evidence, criterion))
+    return Alternative(of_required(nats, own, members, evidence, criterion), left, known)
 
 
 def remove(candidate: Candidate, model: BodyModel, evidence: Evidence) -> tuple[BodyModel, Evidence]:

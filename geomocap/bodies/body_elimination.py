@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomocap.bodies.body_alternatives import Alternative, best_alternative, remove
+from geomocap.bodies.body_alternatives import best_alternative, remove
 from geomocap.bodies.body_criterion import Criterion
 from geomocap.bodies.body_evidence import Candidate, Turns, judge
 from geomocap.bodies.body_model import BodyModel, Evidence
@@ -82,24 +82,22 @@ def eliminate(model: BodyModel, evidence: Evidence, criterion: Criterion, count:
 def _defended(
     model: BodyModel, evidence: Evidence, criterion: Criterion, curve: list[EliminationStep]
 ) -> tuple[BodyModel, Evidence, dict[int, float]]:
-    """Take away the body that the best model without it needs least, until each is needed; what each is worth then.
-
-    The borders are those of the first grouping still: samples chose anew to compare only.
-    """
-    worth: dict[int, Alternative] = {}
+    """Take away the body that the best model without it needs least, until each is needed; what each is worth then."""
+    worth: dict[int, float] = {}
     while True:
         judged = judge(np.unique(model.label).tolist(), model, evidence.with_places_open(), criterion)
         asked = [b for b in judged if b not in worth and judged[b].strength < _SURE]
-        worth |= {b: best_alternative(judged[b], model, evidence, criterion) for b in asked}
-        weakest = min(worth.values(), key=lambda a: (a.evidence, a.candidate.body), default=None)
-        if weakest is None or weakest.evidence >= 1.0 or len(judged) <= _LEAST_BODIES:
-            return model, evidence, {b: alternative.evidence for b, alternative in worth.items()}
+        worth |= {b: best_alternative(judged[b], model, evidence, criterion).evidence for b in asked}
+        weakest = min(worth, key=lambda b: (worth[b], b), default=-1)
+        if weakest < 0 or worth[weakest] >= 1.0 or len(judged) <= _LEAST_BODIES:
+            return model, evidence, worth
         before = model
-        curve[-1] = _step(model, weakest.candidate, weakest.evidence)
-        model, evidence = _weaken(*remove(weakest.candidate, model, evidence), criterion, None, curve)
+        curve[-1] = _step(model, judged[weakest], worth[weakest])
+        best = best_alternative(judged[weakest], model, evidence, criterion)  # others may have gone since
+        model, evidence = _weaken(best.model, best.known, criterion, None, curve)
         stale, _ = _changed(before, model, evidence)
         left = np.unique(model.label)
-        worth = {b: alternative for b, alternative in worth.items() if b in left and not stale[b]}
+        worth = {b: value for b, value in worth.items() if b in left and not stale[b]}
 
 
 def _step(model: BodyModel, weakest: Candidate, strength: float) -> EliminationStep:
