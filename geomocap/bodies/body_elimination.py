@@ -67,12 +67,14 @@ def eliminate(model: BodyModel, evidence: Evidence, criterion: Criterion, count:
     """Take away the weakest body until all are strong enough, or until a given number is left.
 
     Bodies are judged with places at rest of each sample's own: only motion is compared. Beside the others as they move
-    first; those that are left then against the best model without them.
+    first; those that are left then against the best model without them. Where single cameras follow the surface that
+    isn't asked: depths are found from the bodies there, and nearly any bodies explain nearly any motion. (A person on a
+    treadmill, four cameras, five choices of the paths: 112 mm from the markers without asking, 129 with it.)
     """
     curve: list[EliminationStep] = []
     against: dict[int, float] = {}
     model, evidence = _weaken(model, evidence, criterion, count, curve)
-    if count is None:
+    if count is None and evidence.ray is None:
         model, evidence, against = _defended(model, evidence, criterion, curve)
     bodies = np.unique(model.label).tolist()
     _weaken(model, evidence, criterion, max(_LEAST_BODIES, len(bodies) - _FURTHER), curve)

@@ -189,14 +189,13 @@ def _those_that_are_there(
         left = eliminate(model, evidence, criterion, count or None)
         curve = (*(step for step in curve if step.bodies > left.curve[0].bodies), *left.curve)
         evidence = left.evidence
-        model = reassign(left.model, evidence, 3)
-        against, model = left.against[np.unique(model.label)], model.compact()
+        model = reassign(left.model, evidence, 3).compact()
         confidence = confidences(model, evidence, criterion)
         if count or (confidence >= _IS_ONE).all():
             if evidence.ray is None:  # the borders before that are truer
-                model, against = left.model, left.against
-                confidence = confidences(model, evidence, criterion)
-            return model, evidence, curve, np.minimum(confidence, confidence_of(against))
+                model, confidence = left.model, confidences(left.model, evidence, criterion)
+                confidence = np.minimum(confidence, confidence_of(left.against))
+            return model, evidence, curve, confidence
 
 
 def _criterion(settings: MotionBodiesSettings, noise: SurfaceNoise, rigid: bool) -> Criterion:
