@@ -34,8 +34,19 @@ CAUCHY = 2.385  # standard deviations at which an observation counts half (95 % 
 STEP = 1e-4  # of the same, for differences
 
 
+def disagreement(given: Rig, outlines: OutlineRays) -> float:
+    """Median misfit of the two cameras that disagree most about the outlines, pixels.
+
+    NaN where the outlines tell less than twice what a pose has numbers of any camera.
+    """
+    misfits, pairs = _misfits(given, outlines, np.zeros(POSE * len(given))), np.array(camera_pairs(len(given)))
+    told = np.isfinite(misfits).sum(axis=(1, 2))
+    least = min((told[(pairs == c).any(axis=1)].sum() for c in range(len(given)) if len(pairs)), default=0)
+    return _of_worst_pair(misfits) if least >= 2 * POSE else np.nan
+
+
 def correct_cameras(given: Rig, outlines: OutlineRays, resolution: float = 1.0) -> CameraCorrection:
-    """Correct a calibration by the subject's outlines if they contradict it.
+    """Correct a calibration by the subject's outlines if they contradict it by more than their resolution.
 
     Parameters
     ----------
@@ -51,10 +62,12 @@ def correct_cameras(given: Rig, outlines: OutlineRays, resolution: float = 1.0) 
     if min(len(_known(misfits)) for misfits in first) < 2 * POSE * len(given):
         return CameraCorrection(given, given, np.nan, np.nan)
     before = _of_worst_pair(np.concatenate(first, axis=1))
+    if before <= resolution:
+        return CameraCorrection(given, given, before, np.nan)
     fitted = [_adjust(given, half) for half in halves]
     left = [_misfits(given, half, pose) for half, pose in zip(halves, fitted[::-1], strict=True)]
     after = _of_worst_pair(np.concatenate(left, axis=1))
-    called_for = after <= resolution and before > resolution and after**2 < 0.5 * before**2
+    called_for = after <= resolution and after**2 < 0.5 * before**2
     return CameraCorrection(given, _moved(given, _adjust(given, outlines)) if called_for else given, before, after)
 
 

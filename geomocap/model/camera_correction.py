@@ -17,7 +17,7 @@ class CameraCorrection:
         The calibration, and the cameras to use: the same if no correction is called for.
     before, after : float, pixels
         Median disagreement about the outlines of the two cameras that disagree most, and what is left of it in frames
-        that a correction wasn't found from. NaN if the outlines can't tell.
+        that a correction wasn't found from. NaN if the outlines can't tell, or if there was no need for any.
     """
 
     given: Rig

@@ -6,12 +6,13 @@ cameras; given masks are taken as they are.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from geomocap.calibration.silhouette_correction import correct_cameras
+from geomocap.calibration.silhouette_correction import correct_cameras, disagreement
 from geomocap.calibration.silhouette_tangents import OutlineRays
 from geomocap.evaluation.camera_check import BACKGROUND_FRAMES
 from geomocap.files.capture import Capture
@@ -28,7 +29,11 @@ from geomocap.silhouettes.silhouette_scene import SilhouetteScene, learning_fram
 from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 OUTLINES = 32  # frames, spread over the recording
+FIRST = 8  # of these, which are enough where the cameras clearly agree
+CLEAR = 0.5  # of the disagreement that calls for a correction
 LONGEST = 640  # longer side of the images, pixels
+
+_Cutter = Callable[[list[int]], list[tuple[np.ndarray, ...]]]  # silhouettes of all cameras, of frames by their numbers
 
 
 def with_cameras(job: Job) -> tuple[Job, str]:
@@ -61,24 +66,33 @@ def with_cameras(job: Job) -> tuple[Job, str]:
 
 
 def find_correction(job: Job, capture: Capture) -> CameraCorrection:
-    """Hold the calibration against the outlines of frames spread over the recording."""
+    """Hold the calibration against the outlines of frames spread over the recording: of a few, or of all if need be."""
     rig = capture.rig
     plates = all(map(capture.has_background, capture.cameras))
     if not (capture.has_masks or plates or capture.n_recorded >= BACKGROUND_FRAMES):
         return CameraCorrection(rig, rig, np.nan, np.nan)  # there are no silhouettes
     shrink = 1 if capture.has_masks else max(1, round(int(rig.sizes.max()) / LONGEST))
-    chosen = evenly_chosen(capture.n_frames, OUTLINES)
-    if capture.has_masks:
-        masks = [tuple(capture.mask(c, int(k)) for c in capture.cameras) for k in chosen]
-    else:
-        masks = _cut_alone(job, capture, chosen.tolist(), shrink)
-    return correct_cameras(rig, OutlineRays.of(rig, masks), float(shrink))
+    chosen = evenly_chosen(capture.n_frames, OUTLINES).tolist()
+    cut = _given(capture) if capture.has_masks else _alone(job, capture, chosen, shrink)
+    few = chosen[:: OUTLINES // FIRST]
+    masks = dict(zip(few, cut(few), strict=True))
+    said = disagreement(rig, OutlineRays.of(rig, list(masks.values())))
+    if said <= CLEAR * shrink:
+        return CameraCorrection(rig, rig, said, np.nan)
+    others = [k for k in chosen if k not in masks]
+    masks |= zip(others, cut(others), strict=True)
+    return correct_cameras(rig, OutlineRays.of(rig, [masks[k] for k in chosen]), float(shrink))
 
 
-def _cut_alone(job: Job, capture: Capture, frames: list[int], shrink: int) -> list[tuple[np.ndarray, ...]]:
-    """Silhouettes of reduced images, each camera alone."""
+def _given(capture: Capture) -> _Cutter:
+    """Return what gives the masks of frames as they are."""
+    return lambda frames: [tuple(capture.mask(c, k) for c in capture.cameras) for k in frames]
+
+
+def _alone(job: Job, capture: Capture, wanted: list[int], shrink: int) -> _Cutter:
+    """Return what cuts the silhouettes of frames, some of those wanted, from reduced images, each camera alone."""
     settings, learning = job.config.silhouettes, learning_frames(capture.n_frames)
-    look = _Look(LearnBackground(capture, settings, shrink), tuple(sorted({*frames, *learning})))
+    look = _Look(LearnBackground(capture, settings, shrink), tuple(sorted({*wanted, *learning})))
     looks = list(map_items(look, capture.cameras, job.executor, "cameras", job.progress, 2))
     models = [model for model, _ in looks]
     job.backgrounds.update(((c, shrink), model) for c, model in zip(capture.cameras, models, strict=True))
@@ -86,11 +100,12 @@ def _cut_alone(job: Job, capture: Capture, frames: list[int], shrink: int) -> li
     def moments(numbers: list[int]) -> list[_Moment]:
         return [_Moment(k, tuple(known.get(k) for _, known in looks)) for k in numbers]
 
-    scene = SilhouetteScene.unlearnt(models, None, settings)
+    unlearnt = SilhouetteScene.unlearnt(models, None, settings)
     read = _ReadReduced(capture, shrink)
-    count, seen = _CountReduced(read, scene), moments(learning)
-    scene = scene.learnt(map_items(count, seen, job.executor, "cameras", job.progress, 4))
-    return list(map_items(_CutReduced(read, scene), moments(frames), job.executor, "cameras", job.progress, 4))
+    count, seen = _CountReduced(read, unlearnt), moments(learning)
+    scene = unlearnt.learnt(map_items(count, seen, job.executor, "cameras", job.progress, 4))
+    cut = _CutReduced(read, scene)
+    return lambda frames: list(map_items(cut, moments(frames), job.executor, "cameras", job.progress, 4))
 
 
 def reduced(image: np.ndarray, shrink: int) -> np.ndarray:

@@ -11,7 +11,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geomocap.calibration.silhouette_correction import correct_cameras
+from geomocap.calibration.silhouette_correction import correct_cameras, disagreement
 from geomocap.calibration.silhouette_tangents import OutlineRays, camera_pairs, tangent_misfits
 from geomocap.config import Config
 from geomocap.errors import CaptureError, RunError
@@ -21,7 +21,8 @@ from geomocap.files.results import read_voxels
 from geomocap.files.rigs import write_rig
 from geomocap.files.run import Run
 from geomocap.model.rig import Rig
-from geomocap.pipeline.correction_stage import with_cameras
+from geomocap.pipeline import correction_stage
+from geomocap.pipeline.correction_stage import find_correction, with_cameras
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.track_stage import tracks
 from geomocap.pipeline.voxel_stage import voxels
@@ -201,3 +202,30 @@ def test_masks_without_images_are_a_capture(tmp_path, capture):
         assert len(found.points) > 500 and len(np.unique(found.colors)) == 1
         with pytest.raises(CaptureError, match="masks without images"):
             tracks(job)
+
+
+@pytest.mark.parametrize("touched", [False, True])
+def test_all_outlines_are_cut_only_where_a_few_don_t_settle_it(tmp_path, rig, capture, monkeypatch, touched):
+    read = []
+    mask = Capture.mask
+    monkeypatch.setattr(correction_stage, "FIRST", correction_stage.OUTLINES // 2)  # so short a recording tells little
+    monkeypatch.setattr(Capture, "mask", lambda self, camera, k: read.append(k) or mask(self, camera, k))
+    if not touched:
+        write_rig(capture.path / "sparse", rig)
+        capture = Capture.open(capture.path)
+    with ThreadPoolExecutor(1) as executor:
+        found = find_correction(Job(Run(tmp_path / "run"), Config(), executor, capture=capture, fps=25.0), capture)
+    assert found.is_corrected == touched
+    assert len(set(read)) == (FRAMES if touched else FRAMES // 2)
+    assert found.before > 1.0 if touched else found.before < 0.5 and np.isnan(found.after)
+
+
+def test_cameras_of_which_outlines_tell_too_little_aren_t_said_to_agree(rig, masks):
+    blind = [[m * (c > 0) for c, m in enumerate(frame)] for frame in masks]
+    assert np.isnan(disagreement(rig, OutlineRays.of(rig, blind)))
+    assert np.isnan(disagreement(rig.select(["cam0"]), OutlineRays.of(rig.select(["cam0"]), [m[:1] for m in masks])))
+    assert (
+        disagreement(rig, OutlineRays.of(rig, masks))
+        < 0.5
+        < disagreement(turned(rig, 1, 2.0), OutlineRays.of(rig, masks))
+    )
