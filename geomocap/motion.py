@@ -192,7 +192,7 @@ def _connect(
     """
     least = _ALIKE * settings.bodies.least_turn(paths.parts is not None)
     while True:
-        connected = find_motion_skeleton(bodies, fps, settings.skeleton)
+        connected = find_motion_skeleton(bodies, fps, settings.skeleton, depths_found=paths.ray is not None)
         connected, refined = refine_skeleton(connected, bodies, paths, settings.refinement)
         pairs = connected.skeleton.joint_bodies
         if settings.bodies.bodies or settings.refinement.rounds == 0 or not len(pairs):

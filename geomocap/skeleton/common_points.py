@@ -10,7 +10,7 @@ from geomocap.model.rotations import nearest_rotation
 from geomocap.skeleton.hinges import main_axis
 
 _ROUNDS = 6
-_INDEPENDENT = 0.2  # fraction of the frames; neighbouring ones err together
+INDEPENDENT = 0.2  # fraction of the frames; neighbouring ones err together
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,7 @@ def common_point(
     prior: float,
     spread: float,
     noise: float,
+    independence: float = INDEPENDENT,
 ) -> CommonPoint:
     """Least squares point c with R_a c + t_a = R_b c + t_b in all frames, drawn to the bodies' interface.
 
@@ -68,12 +69,14 @@ def common_point(
         How far from the middle of the interface a joint may be, standard deviation.
     noise : float, metres
         Misses below this are all the same.
+    independence : float
+        Fraction of the frames that err independently of each other; 0: all err alike.
     """
     turned = rotations[0] - rotations[1]
     apart = translations[1] - translations[0]
     robust = np.array(weights, float)
     total = max(float(weights.sum()), 1e-9)
-    independent = max(_INDEPENDENT * total, 1.0)
+    independent = max(independence * total, 1.0)
     point = interface
     for k in range(_ROUNDS + 1):
         miss = np.linalg.norm(turned @ point - apart, axis=1)

@@ -15,7 +15,7 @@ from geomocap.model.skeleton import Skeleton, bone_fixed_skeleton
 from geomocap.skeleton.articulated_adjustment import adjust
 from geomocap.skeleton.body_observations import Observations, SkinPoints
 from geomocap.skeleton.borders import Border, contacts, find_borders
-from geomocap.skeleton.common_points import CommonPoint, common_point
+from geomocap.skeleton.common_points import INDEPENDENT, CommonPoint, common_point
 from geomocap.skeleton.kinematics import BodyMotion, Linkage, joint_motion
 from geomocap.skeleton.motion_skeleton_settings import MotionSkeletonSettings
 from geomocap.skeleton.spanning_tree import Connection, connect_by_cost, connection_cost
@@ -43,7 +43,7 @@ class MotionSkeleton:
 
 
 def find_motion_skeleton(
-    bodies: MotionBodies, fps: float, settings: MotionSkeletonSettings | None = None
+    bodies: MotionBodies, fps: float, settings: MotionSkeletonSettings | None = None, depths_found: bool = False
 ) -> MotionSkeleton:
     """Find the joints, connect the bodies, and let bones keep their length.
 
@@ -53,6 +53,9 @@ def find_motion_skeleton(
     fps : float
         Frames per second.
     settings : MotionSkeletonSettings, optional
+    depths_found : bool
+        Bodies follow what single cameras see, whose depths are found from the motion. A sample that lies too deep does
+        so in all frames: motions err alike in them, however many there are, and a joint is the more where bodies touch.
 
     Raises
     ------
@@ -65,7 +68,7 @@ def find_motion_skeleton(
         raise GeometryError("no rigid bodies to connect: at least two frames with motion are needed")
     sizes = np.bincount(bodies.label[bodies.label >= 0], minlength=count) / len(bodies.label)
     # A joint between any two bodies that come near each other
-    connections = possible_connections(bodies, settings)
+    connections = possible_connections(bodies, settings, 0.0 if depths_found else INDEPENDENT)
     # The tree
     hierarchy, chosen = connect_by_cost(connections, count, sizes)
     joints = np.array([c.joint.point for c in chosen]).reshape(-1, 3)
@@ -98,7 +101,9 @@ def _connected_motion(linkage: Linkage, bodies: MotionBodies, middle: np.ndarray
     return adjust(linkage, start, points, observations).bodies
 
 
-def possible_connections(bodies: MotionBodies, settings: MotionSkeletonSettings) -> list[Connection]:
+def possible_connections(
+    bodies: MotionBodies, settings: MotionSkeletonSettings, independence: float = INDEPENDENT
+) -> list[Connection]:
     """Joints between all bodies that come near each other, and more until every body can be reached."""
     count = bodies.body_count
     limit = settings.largest_gap * bodies.diagonal
@@ -117,7 +122,8 @@ def possible_connections(bodies: MotionBodies, settings: MotionSkeletonSettings)
             (bodies.translations[:, a], bodies.translations[:, b]),
         )
         reliability = np.minimum(bodies.reliability[:, a], bodies.reliability[:, b]) + 1e-3
-        joint = common_point(*motions, reliability, border.middle, settings.interface_prior, border.spread, noise)
+        prior = settings.interface_prior
+        joint = common_point(*motions, reliability, border.middle, prior, border.spread, noise, independence)
         off = float(np.linalg.norm(joint.point - border.middle))
         fraction = float(contact[a, b] / min(whole[a], whole[b]))
         cost = connection_cost(joint.miss, off, border.gap, fraction, weights)

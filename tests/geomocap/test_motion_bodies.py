@@ -18,7 +18,7 @@ from geomocap.model.rotations import turn_angles
 from geomocap.motion import unsure_turns
 from geomocap.skeleton.bone_motion import forward_kinematics
 from geomocap.skeleton.borders import Border
-from geomocap.skeleton.common_points import common_point
+from geomocap.skeleton.common_points import INDEPENDENT, common_point
 from geomocap.skeleton.motion_skeleton import find_motion_skeleton
 from geomocap.skeleton.refinement import refine_skeleton
 from tests.geomocap.moving_chains import chain, same_partition, seen_by_single_cameras
@@ -316,6 +316,34 @@ def test_joint_of_motions_that_do_not_tell_stays_at_the_interface():
         return float(np.linalg.norm(joint.point - near))
 
     assert away(1e3) > 0.5 and away(0.05) < 0.05
+
+
+def test_joint_of_motions_that_err_alike_in_all_frames_stays_where_bodies_touch():
+    rng = np.random.default_rng(4)
+    turns = Rotation.from_rotvec(np.linspace(-0.2, 0.2, 100)[:, None] * [0.0, 1.0, 0.0]).as_matrix()
+    still = np.broadcast_to(np.eye(3), (100, 3, 3))
+    joint, deeper = np.array([0.1, 0.2, 0.5]), np.array([0.15, 0.0, 0.0])  # the second body is taken to lie deeper
+    shifts = joint + deeper - turns @ (joint + deeper) + rng.normal(scale=0.01, size=(100, 3))
+    near = joint + np.array([0.02, 0.0, 0.01])
+
+    def missed(independence: float) -> float:
+        motions = (still, turns), (np.zeros((100, 3)), shifts)
+        point = common_point(*motions, np.ones(100), near, 0.005, 0.05, 4e-4, independence).point
+        return float(np.linalg.norm(point - joint))
+
+    assert missed(INDEPENDENT) > 0.08 and missed(0.0) < 0.5 * missed(INDEPENDENT)
+
+
+def test_skeleton_of_found_depths_is_nearer_to_the_borders(found):
+    shaken = np.random.default_rng(3).normal(scale=0.01, size=found.translations.shape)
+    bodies = replace(found, translations=found.translations + shaken)
+
+    def away(depths_found: bool) -> float:
+        skeleton = find_motion_skeleton(bodies, 30.0, depths_found=depths_found)
+        off = [j.point - b.middle for j, b in zip(skeleton.joints, skeleton.borders, strict=True)]
+        return float(np.linalg.norm(off, axis=1).max())
+
+    assert away(True) < 0.9 * away(False)
 
 
 def test_precision_beyond_what_surfaces_give_hardly_counts():
