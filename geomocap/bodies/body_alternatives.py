@@ -78,14 +78,15 @@ def without(candidate: Candidate, model: BodyModel, evidence: Evidence, criterio
     before, after = only_seen(evidence.with_places_open()), only_seen(known.with_places_open())
     adjacent = left.adjacent(known.adjacency)
     adjacent[np.ix_(neighbours, neighbours)] = True
-    nats = max(held_together(body, neighbours, model, before, criterion, borders, left), 0.0)
+    nats = max(held_together(body, neighbours, model, criterion, borders, left), 0.0)
+    left_borders = Borders.of(left, known)
     changed = (left.rotations != model.rotations).any(axis=(1, 2, 3))
     for one in (body, *neighbours[changed[neighbours]].tolist()):
         some, _, observations = observed(np.flatnonzero(model.label == one), evidence, criterion)
         more = fitted(observations) if one == body else 1.0
         best = _missed(some, model, before, model.adjacent(before.adjacency), np.array([one]))
         other = _missed(some, left, after, adjacent, neighbours if one == body else np.array([], int))
-        noise = noise_of(some, other.main, other.partner, other.fraction, left, after, criterion)
+        noise = noise_of(some, other.main, other.partner, other.fraction, left, after, criterion, left_borders)
         gain = np.log((noise + other.squares) / (noise + more * best.squares))
         if one == body:
             gain = np.maximum(gain, 0.0)

@@ -37,7 +37,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geomocap.bodies.body_criterion import Criterion
-from geomocap.bodies.body_joints import Borders, held_together, motion_known, neighbours_of, parted, parting, shown
+from geomocap.bodies.body_joints import Borders, held_together, motion_known, neighbours_of, parted, parting
 from geomocap.bodies.body_model import BodyModel, Evidence
 from geomocap.bodies.rigid_motions import relative_turn
 from geomocap.bodies.skin_blending import blend_spans
@@ -127,8 +127,8 @@ def _judge(
         return Candidate(body, np.inf, -1, np.inf, np.inf)
     neighbours = np.flatnonzero(neighbours_of(touching))
     some, samples, observations = observed(members, evidence, criterion)
-    nats, own = _explained(body, neighbours, some, observations, model, evidence, criterion)
-    nats += held_together(body, neighbours, model, evidence, criterion, borders)
+    nats, own = _explained(body, neighbours, some, observations, model, evidence, criterion, borders)
+    nats += held_together(body, neighbours, model, criterion, borders)
     by_evidence = of_required(nats, observations, members, evidence, criterion)
     # what noise feigns is no turn
     inertia = max(samples, 1.0) * _square_radius(evidence.rest[members])
@@ -173,6 +173,7 @@ def _explained(
     model: BodyModel,
     evidence: Evidence,
     criterion: Criterion,
+    borders: Borders,
 ) -> tuple[float, float]:
     """Log likelihood that a body adds to that of its samples, in nats, and the mean square by which it misses them."""
     reached = np.bincount(model.label[evidence.near[some].indices], minlength=model.count)
@@ -190,7 +191,7 @@ def _explained(
     found.costs[:, body] = np.inf  # without it
     row, main = np.arange(len(some)), found.costs.argmin(axis=1)
     missed, partner, fraction = found.costs[row, main], found.partner[row, main], found.fraction[row, main]
-    noise = noise_of(some, main, partner, fraction, model, evidence, criterion)
+    noise = noise_of(some, main, partner, fraction, model, evidence, criterion, borders)
     # what was fitted to few independent observations leaves less than they really miss
     gain = np.maximum(np.log((noise + missed) / (noise + fitted(observations) * own)), 0.0)
     return 0.5 * observations * float(gain.mean()), float(own.mean())
@@ -209,6 +210,7 @@ def noise_of(
     model: BodyModel,
     evidence: Evidence,
     criterion: Criterion,
+    borders: Borders,
 ) -> np.ndarray:
     """Mean square by which blends may miss their samples, (n,), metres²: noise, and the softness of skin."""
     stated = 3.0 * evidence.sigma[some] ** 2
@@ -216,7 +218,7 @@ def noise_of(
         stated[evidence.lone[some].any(axis=1)] = 0.0
     noise: np.ndarray = np.maximum(criterion.noise.variance, stated)
     if criterion.softness > 0:
-        apart = _turned_apart(some, main, partner, model, evidence, criterion)
+        apart = _turned_apart(some, main, partner, model, evidence, criterion, borders)
         # a swing of the least turn to and fro moves what lies around its middle by the mean square a² r² / 3
         soft = 4.0 * fraction * (1.0 - fraction) * criterion.softness**2 * apart
         noise += np.minimum(soft, criterion.min_turn**2 / 3.0 * _square_radius(evidence.rest[some]))
@@ -230,6 +232,7 @@ def _turned_apart(
     model: BodyModel,
     evidence: Evidence,
     criterion: Criterion,
+    borders: Borders,
 ) -> np.ndarray:
     """Mean square by which the two bodies of their blends turn samples apart, (n,), metres²; 0 without a second.
 
@@ -243,7 +246,7 @@ def _turned_apart(
         return apart
     middle = rest.mean(axis=0)
     for one, other in np.unique(np.stack([main, partner])[:, partner >= 0], axis=1).T.tolist():
-        parted = parting(one, other, middle, model, evidence, criterion).var(axis=0).sum()
+        parted = parting(one, other, middle, model, criterion, borders).var(axis=0).sum()
         apart[(main == one) & (partner == other)] -= parted
     return np.maximum(apart, 0.0)
 
@@ -275,21 +278,21 @@ def _motion(
     They slide by what their motions carry their best common point near the border apart, in radii of the larger one.
     Where single cameras follow the surface it may stand off, and slides then without being another body: there it is 0.
     """
-    turn = _turn(first, second, model, evidence)
+    turn = _turn(first, second, model, evidence, borders)
     if evidence.ray is not None:
         return turn, 0.0
-    miss = parted(first, second, borders.places[first, second], model, evidence, criterion)
+    miss = parted(first, second, borders.places[first, second], model, criterion, borders)
     radius = max(_square_radius(evidence.rest[model.label == body]) for body in (first, second))
     return turn, float(np.sqrt(miss / max(radius, 1e-12)))
 
 
-def _turn(first: int, second: int, model: BodyModel, evidence: Evidence) -> float:
+def _turn(first: int, second: int, model: BodyModel, evidence: Evidence, borders: Borders) -> float:
     """Turn of two bodies against each other: mean of that of their motions and of their most different parts.
 
     What samples side by side turn differently is noise, which is taken from that of the parts; where it is so much that
     they are unsure, that of the motions counts more.
     """
-    known = shown(first, second, model, evidence)
+    known = borders.shown(first, second)
     one, other = model.rotations[first, known], model.rotations[second, known]
     if min(evidence.seen[model.label == body, 0].sum() for body in (first, second)) < 3:
         # nothing ties the body to frame 0: its turn counts from the middle of the frames

@@ -14,6 +14,7 @@ from geomocap.model.outlines import Outlines
 from geomocap.scheduling import spread
 
 _HALVINGS = 3  # of a step, where the front is in one
+_BLOCK = 128  # lines that are looked up in a silhouette while it is in the processor's cache
 # Fraction of the views that a place of the hull may be outside of. Depths of a man seen by four cameras erred by 21 mm
 # (90 %) with 0.05, by 27 mm with 0.1, and by 26 mm with 0.02 and silhouettes a pixel wider.
 MAY_MISS = 0.05
@@ -48,20 +49,52 @@ def _misses(place, m, rotations, translations, frames, projections, empty, most)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _count_lines(begin, end, motion, rest, inward, rotations, translations, frames, views, steps, counts):
+    """Number of silhouettes that each place of some lines is outside of, as in `_misses`, into `counts` (n, S).
+
+    A straight line stays one in an image: one projection of it for each view, a division for each place.
+    """
+    projections, empty, length = views
+    K, C, H, W = empty.shape
+    counts[:] = 0
+    at, step = np.empty(3), np.empty(3)
+    start, slope = np.empty(3), np.empty(3)
+    for k in range(K):
+        t = frames[k]
+        for c in range(C):
+            P, image = projections[c], empty[k, c]
+            for i in range(begin, end):
+                m = motion[i]
+                for r in range(3):
+                    at[r], step[r] = translations[m, t, r], 0.0
+                    for d in range(3):
+                        at[r] += rotations[m, t, r, d] * rest[i, d]
+                        step[r] += rotations[m, t, r, d] * length * inward[i, d]
+                for r in range(3):
+                    start[r] = P[r, 0] * at[0] + P[r, 1] * at[1] + P[r, 2] * at[2] + P[r, 3]
+                    slope[r] = P[r, 0] * step[0] + P[r, 1] * step[1] + P[r, 2] * step[2]
+                for n in range(2 * steps + 1):
+                    s = n - steps
+                    w = start[2] + s * slope[2]
+                    if w <= 0:
+                        continue
+                    x, y = (start[0] + s * slope[0]) / w + 0.5, (start[1] + s * slope[1]) / w + 0.5
+                    if x >= 0 and y >= 0 and x < W and y < H:
+                        counts[i - begin, n] += image[int(y), int(x)]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fronts(begin, end, motion, rest, inward, rotations, translations, frames, views, steps, may_miss, shift, missed):
     projections, empty, step = views
     allowed = int(may_miss * empty.shape[0] * empty.shape[1])
-    place, counts = np.empty(3), np.empty(2 * steps + 1, np.int64)
+    place, lines = np.empty(3), np.empty((_BLOCK, 2 * steps + 1), np.int32)
     for i in range(begin, end):
-        least = empty.shape[0] * empty.shape[1]
-        for n in range(2 * steps + 1):
-            s = (n + 1) // 2 if n % 2 else -(n // 2)  # 0, 1, -1, 2, -2, …
-            for c in range(3):
-                place[c] = rest[i, c] + s * step * inward[i, c]
-            most = least + allowed
-            count = _misses(place, motion[i], rotations, translations, frames, projections, empty, most)
-            counts[steps + s] = count
-            least = min(least, count)
+        row = (i - begin) % _BLOCK
+        if row == 0:
+            last = min(i + _BLOCK, end)
+            _count_lines(i, last, motion, rest, inward, rotations, translations, frames, views, steps, lines)
+        counts = lines[row]
+        least = counts.min()
         missed[i] = least / max(empty.shape[0] * empty.shape[1], 1)
         s = steps
         if counts[s] > least + allowed:  # before the hull

@@ -75,14 +75,14 @@ def test_a_body_adds_to_the_joints_of_those_it_joins(three):
     assert abs(borders.places[0, 1, 0] - three.joints[0, 0]) < 0.03
     criterion = Criterion(settings.least_turn(rigid=False), first.noise, settings.min_fraction, settings.soft_fraction)
     for body, neighbours in ((0, [1]), (2, [1])):
-        assert held_together(body, np.array(neighbours), model, first.evidence, criterion, borders) == 0
+        assert held_together(body, np.array(neighbours), model, criterion, borders) == 0
     # without the middle one the outer two would have to meet, which they do nowhere
-    assert held_together(1, np.array([0, 2]), model, first.evidence, criterion, borders) > 3
+    assert held_together(1, np.array([0, 2]), model, criterion, borders) > 3
     # two halves of one body join nothing that the other half doesn't
     halves = np.where((three.body == 1) & (np.arange(len(three.body)) % 2 == 0), 3, three.body)
     model = model_of_labels(halves, first.evidence)
     borders = Borders.of(model, first.evidence)
-    assert held_together(3, np.array([0, 1, 2]), model, first.evidence, criterion, borders) < 0.5
+    assert held_together(3, np.array([0, 1, 2]), model, criterion, borders) < 0.5
 
 
 def test_few_samples_that_hardly_touch_others_are_no_body(three):
