@@ -55,30 +55,6 @@ def hull(views: PinholeViews, grid: Grid, settings: HullSettings = _DEFAULT) -> 
     return occupancy
 
 
-def visual_hull(
-    views: PinholeViews, grid: Grid, settings: HullSettings = _DEFAULT, out: np.ndarray | None = None
-) -> np.ndarray:
-    """Carve the visual hull into an array (X, Y, Z) uint8, 1 where occupied.
-
-    Parameters
-    ----------
-    views : PinholeViews
-    grid : Grid
-    settings : HullSettings
-    out : (X, Y, Z) uint8, optional
-        Array to fill and return, to be used again for the next frame.
-    """
-    return hull(views, grid, settings).dense(out)
-
-
-def hull_surface(views: PinholeViews, grid: Grid, settings: HullSettings = _DEFAULT) -> np.ndarray:
-    """Carve the visual hull and return its surface voxels, (N, 3) int32, sorted by x, y, z index.
-
-    A voxel is on the surface if one of its six neighbours is empty or beyond the grid.
-    """
-    return hull(views, grid, settings).surface_indices()
-
-
 def heard(views: PinholeViews, settings: HullSettings) -> tuple[PinholeViews, np.ndarray, int]:
     """Tell of what each camera has a say.
 

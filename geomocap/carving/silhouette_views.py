@@ -210,18 +210,6 @@ class Undistortion:
                 )
 
 
-def undistort_masks(rig: Rig, masks: Sequence[np.ndarray]) -> PinholeViews:
-    """Undistort the silhouettes of one frame; for many frames make one `Undistortion` and use its `views`.
-
-    Parameters
-    ----------
-    rig : Rig
-    masks : C arrays (H_c, W_c)
-        Silhouettes in the original images, not 0 where the subject is.
-    """
-    return Undistortion.of(rig).views(masks)
-
-
 def pad(images: Sequence[np.ndarray]) -> np.ndarray:
     """Gather images (H_c, W_c, …) uint8 at the top left of one array (C, H, W, …) with zeros elsewhere."""
     height, width = max(i.shape[0] for i in images), max(i.shape[1] for i in images)

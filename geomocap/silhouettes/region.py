@@ -44,11 +44,5 @@ def region_of_points(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return mask
 
 
-def region_of_box(box: tuple[float, float, float, float], size: tuple[int, int]) -> np.ndarray:
-    """Return an upright box x0, y0, x1, y1 (pixels) of an image of a size (width, height) as (H, W) bool."""
-    x0, y0, x1, y1 = box
-    return region_of_points(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]), size)
-
-
 def _cross(a, b):
     return a[0] * b[1] - a[1] * b[0]

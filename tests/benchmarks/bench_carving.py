@@ -7,7 +7,7 @@ import open3d as o3d
 
 from geomocap.carving.carving_settings import CarvingSettings, ConsistencySettings, HullSettings
 from geomocap.carving.frames import carve_frame
-from geomocap.carving.hull import hull, hull_surface, visual_hull
+from geomocap.carving.hull import hull
 from geomocap.carving.silhouette_views import PinholeViews
 from geomocap.carving.subject_bounds import subject_box
 from geomocap.carving.visibility import SurfaceVoxels, depth_buffers
@@ -55,18 +55,18 @@ def benchmark() -> list[Row]:
     images = textured_images(views)
     out = np.zeros(GRID.shape, np.uint8)
     brute = visual_hull_brute(views, GRID)
-    same = "identical" if np.array_equal(visual_hull(views, GRID), brute) else "DIFFERENT from brute force"
+    same = "identical" if np.array_equal(hull(views, GRID).dense(), brute) else "DIFFERENT from brute force"
     plain = CarvingSettings(consistency=ConsistencySettings(enabled=False))
     consistent = CarvingSettings()
 
     ours = measure(lambda: hull(PinholeViews.of(P, masks), GRID), 25)
     brute_time = measure(lambda: visual_hull_brute(views, GRID), 7)
-    note = f"{same}; {int(brute.sum()):,} voxels, {len(hull_surface(views, GRID)):,} on the surface"
+    note = f"{same}; {int(brute.sum()):,} voxels, {len(hull(views, GRID).surface_indices()):,} on the surface"
     return [
         Row("hull, 8 × 320×240, 256³", ours, "Numba brute force", brute_time, "≤ 6 ms, ≥ 10 ×", note),
         Row(
             "hull into an array of bytes",
-            measure(lambda: visual_hull(views, GRID, out=out), 25),
+            measure(lambda: hull(views, GRID).dense(out), 25),
             "Numba brute force",
             brute_time,
             "",
@@ -86,7 +86,7 @@ def benchmark() -> list[Row]:
             measure(lambda: visual_hull_brute(full, GRID), 3),
         ),
         Row("hull, outside unseen", measure(lambda: hull(views, GRID, HullSettings(outside="unseen")), 15)),
-        Row("surface voxels of the hull, sorted", measure(lambda: hull_surface(views, GRID), 25)),
+        Row("surface voxels of the hull, sorted", measure(lambda: hull(views, GRID).surface_indices(), 25)),
         Row("one frame, colours by visibility", measure(lambda: carve_frame(views, GRID, plain, images), 9)),
         Row(
             "one frame, colour consistency",

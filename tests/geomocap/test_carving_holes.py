@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 
 from geomocap.carving.holes import enclosed_holes, fill_false_holes
-from geomocap.carving.silhouette_views import undistort_masks
+from geomocap.carving.silhouette_views import Undistortion
 from geomocap.model.rig import Rig
 
 SIZE = 120
@@ -59,7 +59,7 @@ def test_false_hole_is_filled_and_a_real_gap_kept(torso_and_ring):
     u, v = rig.project(np.array([[-0.3, 0.0, 0.0]]))[1, 0]
     cv2.circle(damaged[1], (int(u), int(v)), 5, 0, -1)
     assert (damaged[1] != masks[1]).sum() > 50
-    repaired = fill_false_holes(rig, undistort_masks(rig, damaged), damaged)
+    repaired = fill_false_holes(rig, Undistortion.of(rig).views(damaged), damaged)
     for c in range(len(rig)):
         np.testing.assert_array_equal(repaired[c], masks[c], err_msg=f"camera {c}")
     assert any(enclosed_holes(m) for m in masks), "no camera sees through the ring: the test shows nothing"
@@ -72,7 +72,7 @@ def test_cameras_that_see_nothing_or_a_part_bear_no_witness(torso_and_ring):
     damaged[3][:] = 0
     u, v = rig.project(np.array([[-0.3, 0.0, 0.0]]))[1, 0]
     cv2.circle(damaged[1], (int(u), int(v)), 5, 0, -1)
-    views = undistort_masks(rig, damaged)
+    views = Undistortion.of(rig).views(damaged)
     views.valid[4, : SIZE // 2] = 0
     views.masks[4, : SIZE // 2] = 0
     repaired = fill_false_holes(rig, views, damaged)
@@ -85,7 +85,7 @@ def test_too_few_cameras_fill_nothing(torso_and_ring):
     damaged = [m.copy() for m in masks[:3]]
     u, v = rig.project(np.array([[-0.3, 0.0, 0.0]]))[1, 0]
     cv2.circle(damaged[1], (int(u), int(v)), 5, 0, -1)
-    repaired = fill_false_holes(some, undistort_masks(some, damaged), damaged)
+    repaired = fill_false_holes(some, Undistortion.of(some).views(damaged), damaged)
     np.testing.assert_array_equal(repaired[1], damaged[1])
 
 

@@ -11,7 +11,7 @@ from scipy.ndimage import binary_erosion
 
 from geomocap.carving.block_kernels import summed
 from geomocap.carving.carving_settings import HullSettings
-from geomocap.carving.hull import hull_surface, visual_hull
+from geomocap.carving.hull import hull
 from geomocap.carving.occupancy import Occupancy
 from geomocap.carving.silhouette_views import PinholeViews
 from geomocap.carving.voxel_grid import Grid
@@ -67,7 +67,7 @@ def test_octree_is_brute_force_bit_for_bit(seed, outside, min_views, tolerance):
     grid = Grid(rng.normal(size=3) - 1, 2.0 / max(shape) * rng.uniform(0.3, 2), shape)
     options = HullSettings(outside=outside, min_views=min_views, tolerance=tolerance)
     expected = visual_hull_numpy(views, grid, options)
-    np.testing.assert_array_equal(visual_hull(views, grid, options), expected)
+    np.testing.assert_array_equal(hull(views, grid, options).dense(), expected)
     if outside == "empty" and tolerance == 0:
         np.testing.assert_array_equal(visual_hull_brute(views, grid), expected)
 
@@ -82,7 +82,7 @@ def test_far_from_the_origin_it_is_still_exact(offset):
     grid = Grid(move - np.array([0.6, 0.6, 0.1]), 2 / 64, (40, 40, 64))
     expected = visual_hull_numpy(views, grid)
     assert expected.sum() > 500
-    np.testing.assert_array_equal(visual_hull(views, grid), expected)
+    np.testing.assert_array_equal(hull(views, grid).dense(), expected)
 
 
 def test_result_does_not_depend_on_the_number_of_threads_or_the_buffer():
@@ -90,11 +90,11 @@ def test_result_does_not_depend_on_the_number_of_threads_or_the_buffer():
     views = PinholeViews.of(P, silhouettes(P, FIGURE))
     grid = Grid(np.array([-0.6, -0.6, -0.1]), 2 / 96, (60, 57, 96))
     out = np.full(grid.shape, 7, np.uint8)
-    assert visual_hull(views, grid, out=out) is out
+    assert hull(views, grid).dense(out) is out
     threads = numba.get_num_threads()
     try:
         numba.set_num_threads(1)
-        alone = visual_hull(views, grid)
+        alone = hull(views, grid).dense()
     finally:
         numba.set_num_threads(threads)
     np.testing.assert_array_equal(out, alone)
@@ -104,14 +104,14 @@ def test_hull_of_a_sphere_encloses_it_closely():
     radius, P = 0.4, ring(24, target=(0.1, 0.2, 0.5))
     views = PinholeViews.of(P, silhouettes(P, np.array([[0.1, 0.2, 0.5, radius, radius, radius]])))
     grid = Grid.of_box(np.array([-0.5, -0.4, -0.1]), np.array([0.7, 0.8, 1.1]), resolution=96)
-    occupied = visual_hull(views, grid)
+    occupied = hull(views, grid).dense()
     # 24 cones round a sphere leave little more than it; at its outline the pixels' centres decide
     assert 0.98 < occupied.sum() * grid.voxel_size**3 / (4 / 3 * np.pi * radius**3) < 1.1
     x, y, z = grid.axes()
     depth = radius - np.sqrt((x[:, None, None] - 0.1) ** 2 + (y[:, None] - 0.2) ** 2 + (z - 0.5) ** 2)
     pixel = 3.4 / 300  # metres at the subject's distance
     assert occupied[depth > pixel].all()
-    surface = np.linalg.norm(grid.centers(hull_surface(views, grid)) - [0.1, 0.2, 0.5], axis=1)
+    surface = np.linalg.norm(grid.centers(hull(views, grid).surface_indices()) - [0.1, 0.2, 0.5], axis=1)
     assert abs(np.median(surface) - radius) < grid.voxel_size
 
 
@@ -143,10 +143,10 @@ def test_outside_a_view_is_an_explicit_choice():
     seen[2][:, :160] = 0
     views = PinholeViews.of(P, masks, seen)
     grid = Grid(np.array([-0.6, -0.6, -0.1]), 2 / 64, (40, 40, 64))
-    empty = visual_hull(views, grid, HullSettings(outside="empty"))
-    unseen = visual_hull(views, grid, HullSettings(outside="unseen", min_views=2))
-    whole = visual_hull(PinholeViews.of(P, masks), grid)
-    pair = visual_hull(views.without(2), grid)
+    empty = hull(views, grid, HullSettings(outside="empty")).dense()
+    unseen = hull(views, grid, HullSettings(outside="unseen", min_views=2)).dense()
+    whole = hull(PinholeViews.of(P, masks), grid).dense()
+    pair = hull(views.without(2), grid).dense()
     assert empty.sum() < whole.sum() < unseen.sum() < pair.sum()
     assert (empty <= whole).all() and (whole <= unseen).all() and (unseen <= pair).all()
 
@@ -159,9 +159,9 @@ def test_tolerance_closes_a_hole_of_one_silhouette():
     masks[0][110:130, :] = 0
     holed = PinholeViews.of(P, masks)
     grid = Grid(np.array([-0.6, -0.6, -0.1]), 2 / 64, (40, 40, 64))
-    expected = visual_hull(whole, grid)
-    assert (visual_hull(holed, grid) < expected).sum() > 50
-    assert (visual_hull(holed, grid, HullSettings(tolerance=1)) >= expected).all()
+    expected = hull(whole, grid).dense()
+    assert (hull(holed, grid).dense() < expected).sum() > 50
+    assert (hull(holed, grid, HullSettings(tolerance=1)).dense() >= expected).all()
 
 
 def test_grids_cover_their_box_with_cubes():

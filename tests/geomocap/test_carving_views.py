@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from geomocap.carving.silhouette_views import PinholeViews, Undistortion, pad, undistort_masks
+from geomocap.carving.silhouette_views import PinholeViews, Undistortion, pad
 from geomocap.errors import CalibrationError
 from geomocap.model.rig import Rig
 
@@ -21,7 +21,7 @@ def test_without_distortion_masks_stay_as_they_are_and_sizes_may_differ():
     r = rig((32, 20, [40, 40, 16, 10, 0, 0, 0, 0]), (24, 30, [40, 41, 12, 15, 0, 0, 0, 0]))
     rng = np.random.default_rng(0)
     masks = [(rng.random((20, 32)) < 0.5) * np.uint8(255), rng.random((30, 24)) < 0.5]
-    views = undistort_masks(r, masks)
+    views = Undistortion.of(r).views(masks)
     assert views.masks.shape == (2, 30, 32)
     for c, mask in enumerate(masks):
         h, w = mask.shape

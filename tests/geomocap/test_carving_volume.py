@@ -18,7 +18,7 @@ from geomocap.carving.agreement import (
 from geomocap.carving.block_kernels import possible_parts, summed
 from geomocap.carving.carving_settings import CarvingSettings, HullSettings
 from geomocap.carving.frames import carve_frame
-from geomocap.carving.hull import heard, hull, hull_surface, rounding_bounds, visual_hull
+from geomocap.carving.hull import heard, hull, rounding_bounds
 from geomocap.carving.silhouette_views import PinholeViews
 from geomocap.carving.subject_bounds import connected_keys, subject_box
 from geomocap.carving.volume import working_volume
@@ -54,10 +54,10 @@ def test_box_is_the_subject_s(P, slack):
 def test_cameras_on_an_arc_get_the_whole_hull():
     views = figure(ring(4, arc_deg=40))
     grid = working_volume([views])
-    check_inside(hull_surface(views, grid), grid, 0)
+    check_inside(hull(views, grid).surface_indices(), grid, 0)
     assert (grid.low <= LOW).all() and (grid.high >= HIGH).all()
     # along the ray the hull is longer than the subject: nobody looks from the side
-    assert 1.2 < np.ptp(grid.centers(hull_surface(views, grid))[:, 0]) < 2.0
+    assert 1.2 < np.ptp(grid.centers(hull(views, grid).surface_indices())[:, 0]) < 2.0
 
 
 def test_volume_holds_all_frames_and_nothing_depends_on_false_blobs():
@@ -135,15 +135,15 @@ def test_agreeing_silhouettes_are_explained():
 
 def test_a_camera_that_looks_away_is_named():
     P = ring(6)
-    hull = HullSettings(outside="empty")
-    check_cameras(figure(P), hull)
+    settings = HullSettings(outside="empty")
+    check_cameras(figure(P), settings)
     center = -np.linalg.solve(P[2, :, :3], P[2, :, 3])
     P[2] = look_at(center, 2 * center, 300, 320, 240)
     with pytest.raises(CalibrationError, match="camera cam2 looks away"):
-        check_cameras(PinholeViews.of(P, [np.ones((240, 320))] * 6, names=[f"cam{c}" for c in range(6)]), hull)
+        check_cameras(PinholeViews.of(P, [np.ones((240, 320))] * 6, names=[f"cam{c}" for c in range(6)]), settings)
     P[4] = look_at(center, 2 * center, 300, 320, 240)
     with pytest.raises(CalibrationError, match="no point is seen by all cameras"):
-        check_cameras(PinholeViews.of(P, [np.ones((240, 320))] * 6), hull)
+        check_cameras(PinholeViews.of(P, [np.ones((240, 320))] * 6), settings)
 
 
 def test_cameras_that_all_look_elsewhere_are_reported():
@@ -178,8 +178,8 @@ def test_cameras_that_cut_the_subject_off_dont_cut_its_volume():
     views = PinholeViews.of(lowered, masks)
     assert views.cut_off().nonzero()[0].tolist() == [1, 4, 6] and views.blind().nonzero()[0].tolist() == [3]
     grid = Grid.of_box(LOW - 0.2, HIGH + 0.2, resolution=96)
-    cut, complete = visual_hull(views, grid), visual_hull(PinholeViews.of(P, whole), grid)
-    rest = visual_hull(PinholeViews.of(P, whole).without(6).without(4).without(3).without(1), grid)
+    cut, complete = hull(views, grid).dense(), hull(PinholeViews.of(P, whole), grid).dense()
+    rest = hull(PinholeViews.of(P, whole).without(6).without(4).without(3).without(1), grid).dense()
     assert (complete <= cut).all() and (cut <= rest).all() and complete.sum() < cut.sum() < rest.sum()
     low, high = subject_box(views, HullSettings())
     assert (low <= LOW + 0.02).all() and (high >= HIGH - 0.02).all()
@@ -237,8 +237,8 @@ def test_subject_outside_the_volume():
     assert len(allowed.indices) > 100
     whole = Grid.of_box(LOW - 0.1, HIGH + 0.1, resolution=64)
     voxels = carve_frame(views, whole)
-    np.testing.assert_array_equal(voxels.indices, hull_surface(views, whole))
-    assert visual_hull(views, whole)[tuple(voxels.indices.T)].all() and (voxels.colors == voxels.colors[0, 0]).all()
+    np.testing.assert_array_equal(voxels.indices, hull(views, whole).surface_indices())
+    assert hull(views, whole).dense()[tuple(voxels.indices.T)].all() and (voxels.colors == voxels.colors[0, 0]).all()
 
 
 def test_a_frame_that_leaves_much_room_doesnt_make_all_frames_coarse():

@@ -19,7 +19,7 @@ from geomocap.silhouettes.background import (
 from geomocap.silhouettes.evidence import background_misfit, smooth_evidence
 from geomocap.silhouettes.joint_decision import coverage, silhouette
 from geomocap.silhouettes.light import light_change
-from geomocap.silhouettes.region import region_of_box, region_of_points
+from geomocap.silhouettes.region import region_of_points
 from geomocap.silhouettes.shadows import shadow_misfit
 from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
@@ -183,7 +183,7 @@ def test_an_empty_scene_gives_an_empty_mask_and_another_scene_a_full_one(model: 
 
 
 def test_region_limits_the_silhouette(walk: Scene, model: BackgroundModel) -> None:
-    region = region_of_box((0, 0, W, 100), (W, H))
+    region = region_of_points(np.array([[0, 0], [W, 0], [W, 100], [0, 100]]), (W, H))
     assert region[:100].all() and not region[100:].any()
     mask = silhouette(walk.frames[2], model, region=region)
     assert mask[:100].any() and not mask[100:].any()
