@@ -71,10 +71,9 @@ def find_bodies_and_depths(
 ) -> tuple[MotionBodies, MotionPaths]:
     """Find bodies, from their motions the depths of what single cameras see, and bodies from these; again and again.
 
-    Wrong depths make a surface that no rigid bodies move. So of the first bodies and those of `depth_rounds` further
-    rounds those are taken whose paths show the least noise, the latest of equals; with `outlines`, the silhouettes of
-    these cameras, the first count only if there are no others. Other parameters and errors are those of
-    `find_motion_bodies`. Also returns the paths that the bodies are of.
+    Wrong depths make a surface that no rigid bodies move, so `depth_rounds` further rounds come nearer and nearer. With
+    `outlines`, the silhouettes of these cameras, depths are those of the hull that all frames leave. Other parameters
+    and errors are those of `find_motion_bodies`. Also returns the paths that the bodies are of.
     """
     settings = settings or MotionBodiesSettings()
     if outlines is not None:
@@ -82,15 +81,12 @@ def find_bodies_and_depths(
     rounds = settings.depth_rounds if paths.ray is not None and paths.ray.any() else 0
     progress(_STAGE, 0, 1 + rounds)
     bodies = find_motion_bodies(paths, settings)
-    progress(_STAGE, 1, 1 + rounds)
-    best = bodies, paths
-    for k in range(rounds):
+    for k in range(1, 1 + rounds):
+        progress(_STAGE, k, 1 + rounds)
         paths = settle_depths(paths, bodies, outlines)
         bodies = find_motion_bodies(paths, settings)
-        if bodies.noise <= best[0].noise or (outlines is not None and k == 0):
-            best = bodies, paths
-        progress(_STAGE, 2 + k, 1 + rounds)
-    return best
+    progress(_STAGE, 1 + rounds, 1 + rounds)
+    return bodies, paths
 
 
 def settle_depths(paths: MotionPaths, bodies: MotionBodies, outlines: Outlines | None = None) -> MotionPaths:

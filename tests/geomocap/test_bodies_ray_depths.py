@@ -143,24 +143,25 @@ def test_bodies_come_out_better_by_their_own_depths(three, alone, bodies):
     assert_array_equal(at_once.label, find_motion_bodies(alone).label)
 
 
-def test_bodies_of_the_paths_with_the_least_noise_are_taken(monkeypatch, alone, bodies):
-    noises = iter([5e-3, 3e-3, 3e-3, 4e-3])
-    found, reported = [], []
+def test_bodies_of_the_last_round_are_taken(monkeypatch, alone, bodies):
+    noises = iter([5e-3, 2e-3, 3e-3, 4e-3])  # which say nothing
+    found, settled, reported = [], [], []
 
     def find(paths, settings):
         found.append((replace(bodies, noise=next(noises)), paths))
         return found[-1][0]
 
+    def settle(paths, of, outlines):
+        settled.append((of, replace(paths)))
+        return settled[-1][1]
+
     monkeypatch.setattr(ray_depths, "find_motion_bodies", find)
-    monkeypatch.setattr(ray_depths, "settle_depths", lambda paths, *_: replace(paths))
+    monkeypatch.setattr(ray_depths, "settle_depths", settle)
     settings = MotionBodiesSettings(depth_rounds=3)
-    best, paths = find_bodies_and_depths(alone, settings, lambda *step: reported.append(step))
-    assert best is found[2][0] and paths is found[2][1]
+    last, paths = find_bodies_and_depths(alone, settings, lambda *step: reported.append(step))
+    assert last is found[3][0] and paths is found[3][1] is settled[2][1]
+    assert all(of is before for (of, _), (before, _) in zip(settled, found, strict=False))
     assert reported == [("bodies", k, 4) for k in range(5)]
-    # silhouettes tell depths that the first bodies don't have, so these don't count
-    noises, outlines = iter([1e-3, 3e-3, 2e-3, 4e-3]), Outlines(np.arange(1), np.zeros((1, 3, 4)), NOTHING)
-    found.clear()
-    assert find_bodies_and_depths(alone, settings, outlines=outlines)[0] is found[2][0]
 
 
 def test_where_silhouettes_say_nothing_depths_are_those_of_the_motion(three, alone, bodies):
