@@ -30,7 +30,9 @@ from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 OUTLINES = 32  # frames, spread over the recording
 FIRST = 8  # of these, which are enough where the cameras clearly agree
-CLEAR = 0.5  # of the disagreement that calls for a correction
+# Of the disagreement that calls for a correction. Of right cameras the worst pair disagreed by 0.2 to 0.64 pixels in
+# eight captures, and 8 frames told it to 0.03 in two of them.
+CLEAR = 0.5
 LONGEST = 640  # longer side of the images, pixels
 
 _Cutter = Callable[[list[int]], list[tuple[np.ndarray, ...]]]  # silhouettes of all cameras, of frames by their numbers
