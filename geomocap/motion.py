@@ -21,6 +21,7 @@ from geomocap.model.outlines import Outlines
 from geomocap.model.skeleton import Skeleton
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.nodes.node_tracking import track_nodes
+from geomocap.nodes.surface_coverage import even_spacing
 from geomocap.progress import Progress, silent
 from geomocap.settings import Settings
 from geomocap.skeleton.common_points import CommonPoint
@@ -28,7 +29,7 @@ from geomocap.skeleton.motion_skeleton import MotionSkeleton, MotionSkeletonSett
 from geomocap.skeleton.refinement import RefinementSettings, refine_skeleton
 from geomocap.trajectories.selection import spread_out
 
-SAMPLES = 2000  # motion paths that bodies are found from: more cost time and find the same
+SAMPLES = 1000  # that would be evenly over the surface: motion paths that bodies are found from (see docs, results)
 _UNSURE_DEG = 30.0  # 3 to 8 with eight cameras; with four that show the bodies 12, in a cluttered room 29
 # Of the least turn of a body, by which two must turn against each other once refined. Two halves of a shield that had
 # passed as bodies turned by 1° then. With all of it true pieces of trunks went, which came out 1° below: of a horse's
@@ -210,13 +211,22 @@ def _sampled(tracks: np.ndarray, sigma: np.ndarray | None) -> tuple[MotionPaths,
     """Motion paths of long tracks, evenly over the surface, and which tracks these are, (S,) int."""
     if tracks.ndim != 3 or tracks.shape[2] != 3:
         raise GeometryError(f"tracks have shape {tracks.shape}, expected (N, T, 3): N points in T frames, metres")
-    samples = spread_out(tracks, SAMPLES)
+    samples = evenly_over_surface(tracks)
     if sigma is not None:
         sigma = np.asarray(sigma, float)
         if sigma.shape not in (tracks.shape[:1], tracks.shape[:2]):
             raise GeometryError(f"sigma has shape {sigma.shape}, expected {tracks.shape[:1]} or {tracks.shape[:2]}")
         sigma = sigma[samples]
     return MotionPaths(np.asarray(tracks[samples], float), sigma=sigma), samples
+
+
+def evenly_over_surface(tracks: np.ndarray) -> np.ndarray:
+    """Which of tracks (N, T, 3), metres, NaN where unseen, bodies are found from: long ones, evenly, (S,) int."""
+    seen = np.isfinite(tracks).all(axis=2)
+    fullest = int(seen.sum(axis=0).argmax())
+    if not seen[:, fullest].any():
+        return np.empty(0, int)
+    return spread_out(tracks, even_spacing(tracks[seen[:, fullest], fullest], SAMPLES))
 
 
 def _followed(

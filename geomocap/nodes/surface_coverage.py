@@ -24,10 +24,22 @@ def piece_reach(points: np.ndarray) -> float:
     Parameters
     ----------
     points : (M, 3) float, metres
-        A frame's surface, evenly.
+        Of a frame's surface.
     """
     middles = points[farthest_points(points, round(1 / SMALLEST_PIECE))]
     return float(cKDTree(middles).query(points)[0].max())
+
+
+def even_spacing(points: np.ndarray, count: int) -> float:
+    """Return the distance, metres, that so many points have if they are spread evenly over the surface.
+
+    Parameters
+    ----------
+    points : (M, 3) float, metres
+        Of the surface, as dense anywhere as they like.
+    count : int
+    """
+    return piece_reach(points) / float(np.sqrt(SMALLEST_PIECE * count))
 
 
 def uncovered(points: np.ndarray, paths: np.ndarray, reach: float) -> np.ndarray:

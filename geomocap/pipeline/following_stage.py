@@ -26,7 +26,7 @@ from geomocap.model.frame_geometry import BodyPoints, Geometry, GeometryPart
 from geomocap.model.skeleton import Skeleton, bone_fixed_skeleton
 from geomocap.pipeline.derived import FROM_BODIES
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.path_choice import patch_paths, point_paths
+from geomocap.pipeline.path_choice import patch_paths, path_spacing, point_paths
 from geomocap.pipeline.track_stage import tracks
 from geomocap.pipeline.window_following import follow_windows, shows_most, surfaces_of
 from geomocap.scheduling import map_items
@@ -87,7 +87,10 @@ def _follow(job: Job, geometry: Geometry, model: SubjectModel, windows: list[ran
 
 def _follow_piece(job: Job, geometry: Geometry, model: SubjectModel, patches: bool) -> FollowedSequence:
     """Look for a model in a recording, or a window of one, and follow it."""
-    paths = patch_paths(read_trajectories(job.run)) if patches else point_paths(job, geometry)
+    if patches:
+        paths = patch_paths(read_trajectories(job.run), path_spacing(geometry))
+    else:
+        paths = point_paths(job, geometry)
     read, settings = surfaces_of(geometry, model), job.config.following
     return follow_model(model, read, len(geometry), geometry.spacing, job.up_axis, paths, settings, job.progress)
 

@@ -14,10 +14,10 @@ from geomocap.files.scans import Scans
 from geomocap.model.frame_geometry import Geometry
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.trajectories import Trajectories
-from geomocap.motion import SAMPLES
+from geomocap.motion import SAMPLES, evenly_over_surface
 from geomocap.nodes.node_tracking import track_nodes
 from geomocap.nodes.node_uncertainty import carried_sigma
-from geomocap.nodes.surface_coverage import SMALLEST_PIECE, left_over, piece_reach, uncovered_fraction
+from geomocap.nodes.surface_coverage import SMALLEST_PIECE, even_spacing, left_over, piece_reach, uncovered_fraction
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.track_stage import frame_reader
 from geomocap.segmentation.m3 import ellipsoid_paths
@@ -30,8 +30,7 @@ ALONE_FRACTION = (
 # real recording) without patches; bodies from nodes explained silhouettes and paths worse there. Nothing between 0.2
 # and 1 was measured: half is where nodes would say more of the surface than patches do.
 LARGEST_BULK = 0.5
-ANCHORS = 2000  # trajectories that keep nodes from sliding
-ANCHOR_FRACTION = 0.1  # those are measured in this fraction of the frames at least
+ANCHOR_FRACTION = 0.1  # of the frames, in which trajectories that keep nodes from sliding are measured at least
 
 
 def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, MotionPaths]:
@@ -63,21 +62,20 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
         found = ellipsoid_paths(geometry.points, len(geometry), geometry.spacing, settings, job.executor, job.progress)
         return {wanted: MotionPaths(found.ellipsoids.centers.swapaxes(0, 1))}
     tracked = read_trajectories(job.run) if has_tracks else None
-    patches = None if tracked is None or wanted == "both" else patch_paths(tracked)
+    spacing = path_spacing(geometry)
+    patches = None if tracked is None or wanted == "both" else patch_paths(tracked, spacing)
     if wanted == "patches":
         if patches is None:
             raise GeometryError(
                 f"{job.run.path}: no surface patches could be followed in the images; set segmentation.paths = nodes"
             )
         return {"patches": patches}
-    reach = 0.0
     if patches is not None:
-        reach = piece_reach(geometry.points(0))
         # what patches of single cameras leave uncovered is bulk of a hull of few cameras, and mostly no piece
         enough = SMALLEST_PIECE if patches.ray is None else LARGEST_BULK
-        if uncovered_fraction(geometry.points, patches.positions, reach) < enough:
+        if uncovered_fraction(geometry.points, patches.positions, piece_reach(geometry.points(0))) < enough:
             return {"patches": patches}
-    anchors = None if tracked is None else _anchors(tracked)
+    anchors = None if tracked is None else _anchors(tracked, spacing)
     nodes = _follow_nodes(job, geometry, anchors)
     # images hold nodes, which the geometry doesn't know
     held = nodes if anchors is None else replace(nodes, sigma=carried_sigma(nodes.positions, anchors))
@@ -85,9 +83,8 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
         return {"nodes" if tracked is None else "both": held}
     if patches.ray is not None:
         return {"patches": patches, "both": held}
-    # as far from each other as paths would be, were they all over the surface
-    spacing = reach / float(np.sqrt(SMALLEST_PIECE * SAMPLES))
-    return {"pieces": _joined(patches, held, left_over(held.positions, patches.positions, spacing))}
+    rest = np.flatnonzero(left_over(held.positions, patches.positions, spacing))
+    return {"pieces": _joined(patches, held, rest[spread_out(held.positions[rest], spacing)])}
 
 
 def _follow_nodes(job: Job, geometry: Geometry, anchors: MotionPaths | None) -> MotionPaths:
@@ -117,12 +114,17 @@ def point_paths(job: Job, geometry: Geometry) -> MotionPaths | None:
     if wanted not in ("auto", "points") or not isinstance(geometry, Scans):
         return None
     tracks = scan_tracks(geometry, wanted == "points" or geometry.tracked, job.progress)
-    return None if tracks is None else MotionPaths(tracks[spread_out(tracks, SAMPLES)])
+    return None if tracks is None else MotionPaths(tracks[evenly_over_surface(tracks)])
 
 
-def patch_paths(tracked: Trajectories) -> MotionPaths | None:
-    """Long trajectories, evenly over the surface; None: there are none."""
-    chosen = spread_out(tracked.positions, SAMPLES)
+def path_spacing(geometry: Geometry) -> float:
+    """Distance of the paths that bodies are found from, metres: as if all over the surface."""
+    return even_spacing(geometry.points(0), SAMPLES)
+
+
+def patch_paths(tracked: Trajectories, spacing: float) -> MotionPaths | None:
+    """Long trajectories, so far (metres) from each other; None: there are none."""
+    chosen = spread_out(tracked.positions, spacing)
     return _paths_of(tracked, chosen) if len(chosen) else None
 
 
@@ -139,15 +141,15 @@ def _paths_of(tracked: Trajectories, chosen: np.ndarray) -> MotionPaths:
 
 
 def _joined(patches: MotionPaths, nodes: MotionPaths, rest: np.ndarray) -> MotionPaths:
-    """Patches followed by the nodes that are on the rest of the surface, (K,) bool, each with its own precision."""
-    if not rest.any():
+    """Patches followed by the nodes that are on the rest of the surface, (K,) int, each with its own precision."""
+    if not len(rest):
         return patches
     positions = np.concatenate([patches.positions, nodes.positions[rest]])
     assert patches.sigma is not None and nodes.sigma is not None and patches.ray is None
     return MotionPaths(positions, sigma=np.concatenate([patches.sigma, nodes.sigma[rest]]))
 
 
-def _anchors(tracked: Trajectories) -> MotionPaths | None:
+def _anchors(tracked: Trajectories, spacing: float) -> MotionPaths | None:
     """Trajectories that nodes are held by; None: there are none."""
-    chosen = spread_out(tracked.positions, ANCHORS, ANCHOR_FRACTION)
+    chosen = spread_out(tracked.positions, spacing, ANCHOR_FRACTION)
     return _paths_of(tracked, chosen) if len(chosen) else None

@@ -14,7 +14,7 @@ from geomocap.files.run_window import POSES, RunWindow, read_poses, write_poses
 from geomocap.model.frame_geometry import Geometry, GeometryPart
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.path_choice import patch_paths
+from geomocap.pipeline.path_choice import patch_paths, path_spacing
 from geomocap.scheduling import map_items
 from geomocap.skeleton.kinematics import BodyMotion, JointMotion
 from geomocap.subject.following_settings import FollowingSettings
@@ -132,7 +132,7 @@ class _Chain:
         geometry = GeometryPart(self.geometry, window)
         paths: MotionPaths | None = None
         if self.has_tracks:
-            paths = patch_paths(read_trajectories(RunWindow.of(self.run, window)))
+            paths = patch_paths(read_trajectories(RunWindow.of(self.run, window)), path_spacing(geometry))
         model, spacing = self.model, geometry.spacing
         read = surfaces_of(geometry, model)
         return follow_model(model, read, len(window), spacing, model.up, paths, self.settings, known=known)

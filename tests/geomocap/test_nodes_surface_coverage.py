@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geomocap.nodes.surface_coverage import SMALLEST_PIECE, left_over, piece_reach, uncovered, uncovered_fraction
+from geomocap.nodes.surface_coverage import (
+    SMALLEST_PIECE,
+    even_spacing,
+    left_over,
+    piece_reach,
+    uncovered,
+    uncovered_fraction,
+)
 
 FRAMES = 10
 
@@ -25,6 +32,12 @@ def standing(points: np.ndarray) -> np.ndarray:
 def test_reach_is_the_radius_of_a_smallest_piece_however_dense_the_points(step):
     area = np.pi * piece_reach(square(step)) ** 2
     assert SMALLEST_PIECE < area < 2.5 * SMALLEST_PIECE  # discs that cover all overlap
+
+
+@pytest.mark.parametrize("step", [0.01, 0.02])
+def test_even_spacing_is_that_of_so_many_points(step):
+    points = np.concatenate([square(step), square(step / 2)[:4000]])  # denser in one part
+    assert 0.8 / np.sqrt(500) < even_spacing(points, 500) < 1.5 / np.sqrt(500)
 
 
 def test_uncovered_is_what_is_out_of_reach():

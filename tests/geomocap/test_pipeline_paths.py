@@ -11,11 +11,12 @@ import pytest
 from geomocap.config import Config
 from geomocap.errors import GeometryError
 from geomocap.files.run import Run
+from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.trajectories import Trajectories
 from geomocap.motion import SAMPLES
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.path_choice import ALONE_FRACTION, motion_paths, patch_paths
+from geomocap.pipeline.path_choice import ALONE_FRACTION, motion_paths, patch_paths, path_spacing
 from geomocap.segmentation.m3_settings import SegmentationSettings
 
 FRAMES = 3
@@ -66,6 +67,14 @@ def trajectories(count: int, seen: float, lowest: float = -1.0) -> np.ndarray:
     return tracks
 
 
+def patches_of(tracks: np.ndarray) -> MotionPaths:
+    """Those of the tracks that bodies are found from."""
+    followed = Trajectories.of_positions(tracks, sigma=np.full(tracks.shape[:2], 0.002))
+    patches = patch_paths(followed, path_spacing(Ball()))
+    assert patches is not None
+    return patches
+
+
 def test_nodes_leave_colours_alone(job):
     found = motion_paths(job("nodes"), Ball(), False)
     assert list(found) == ["nodes"]
@@ -77,17 +86,18 @@ def test_patches_where_they_cover_the_subject(job):
 
 
 def test_nodes_on_the_piece_that_patches_leave_uncovered(job):
-    tracks = trajectories(SAMPLES, 1.0, 0.0)
+    tracks = trajectories(5 * SAMPLES, 1.0, 0.0)
     found = motion_paths(job("auto", tracks), Ball(), True)
     assert list(found) == ["pieces"]
     paths = found["pieces"]
-    patches, nodes = paths.positions[:SAMPLES], paths.positions[SAMPLES:]
-    np.testing.assert_array_equal(patches, tracks)
+    patches = patches_of(tracks)
+    np.testing.assert_array_equal(paths.positions[: patches.count], patches.positions)
+    nodes = paths.positions[patches.count :]
     assert 20 <= len(nodes) <= 40  # of 60, those on the half without patches
     assert (np.nanmax(nodes[:, :, 2], axis=1) < 0.05).all()
     # the farther nodes are from patches the less precise they are
-    sigma = paths.sigma[SAMPLES:]
-    assert np.nanmedian(sigma) > 5 * np.nanmedian(paths.sigma[:SAMPLES])
+    sigma = paths.sigma[patches.count :]
+    assert np.nanmedian(sigma) > 5 * np.nanmedian(paths.sigma[: patches.count])
     assert np.corrcoef(np.nanmean(nodes[:, :, 2], axis=1), np.nanmean(sigma, axis=1))[0, 1] < -0.8
 
 
@@ -104,11 +114,13 @@ def test_where_single_cameras_follow_less_than_half_of_the_surface_there_are_nod
 
 
 def test_nodes_where_patches_are_there_for_a_while_only(job):
-    tracks = trajectories(SAMPLES, 1.0)
+    tracks = trajectories(5 * SAMPLES, 1.0)
     tracks[:, 1:][tracks[:, 1:, 2] < 0] = np.nan  # 2 of 3 frames
     found = motion_paths(job("auto", tracks), Ball(), True)
     assert list(found) == ["pieces"]
-    patches = patch_paths(Trajectories.of_positions(tracks, sigma=np.full(tracks.shape[:2], 0.002)))
+    patches = patch_paths(
+        Trajectories.of_positions(tracks, sigma=np.full(tracks.shape[:2], 0.002)), path_spacing(Ball())
+    )
     nodes = found["pieces"].positions[patches.count :]
     assert 20 <= len(nodes) <= 40
     assert (np.nanmax(nodes[:, :, 2], axis=1) < 0.05).mean() > 0.85  # patches are there at random: few lie far apart
@@ -145,10 +157,10 @@ def test_rays_go_with_the_paths_where_single_cameras_saw_them():
     tracks = trajectories(40, 1.0)
     ray = np.zeros(tracks.shape)
     tracked = Trajectories.of_positions(tracks, sigma=np.full(tracks.shape[:2], 0.002), ray=ray)
-    found = patch_paths(tracked)
+    found = patch_paths(tracked, 0.0)
     assert found is not None and found.ray is None
     ray[::2, 1] = [0.0, 0.6, 0.8]
-    found = patch_paths(tracked)
+    found = patch_paths(tracked, 0.0)
     assert found is not None and found.ray is not None and found.sigma is not None
     np.testing.assert_array_equal(found.ray, ray)
     np.testing.assert_allclose(found.sigma[::2, 1], 0.002 * ALONE_FRACTION)
