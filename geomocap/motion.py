@@ -29,7 +29,7 @@ from geomocap.skeleton.motion_skeleton import MotionSkeleton, MotionSkeletonSett
 from geomocap.skeleton.refinement import RefinementSettings, refine_skeleton
 from geomocap.trajectories.selection import spread_out
 
-SAMPLES = 1000  # that would be evenly over the surface: motion paths that bodies are found from (see docs, results)
+SAMPLES = 1500  # motion paths that bodies are found from, were they all over the surface: more find the same
 _UNSURE_DEG = 30.0  # 3 to 8 with eight cameras; with four that show the bodies 12, in a cluttered room 29
 # Of the least turn of a body, by which two must turn against each other once refined. Two halves of a shield that had
 # passed as bodies turned by 1° then. With all of it true pieces of trunks went, which came out 1° below: of a horse's
