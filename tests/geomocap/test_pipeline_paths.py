@@ -86,7 +86,7 @@ def test_patches_where_they_cover_the_subject(job):
 
 
 def test_nodes_on_the_piece_that_patches_leave_uncovered(job):
-    tracks = trajectories(5 * SAMPLES, 1.0, 0.0)
+    tracks = trajectories(20 * SAMPLES, 1.0, 0.0)
     found = motion_paths(job("auto", tracks), Ball(), True)
     assert list(found) == ["pieces"]
     paths = found["pieces"]
@@ -114,7 +114,7 @@ def test_where_single_cameras_follow_less_than_half_of_the_surface_there_are_nod
 
 
 def test_nodes_where_patches_are_there_for_a_while_only(job):
-    tracks = trajectories(5 * SAMPLES, 1.0)
+    tracks = trajectories(20 * SAMPLES, 1.0)
     tracks[:, 1:][tracks[:, 1:, 2] < 0] = np.nan  # 2 of 3 frames
     found = motion_paths(job("auto", tracks), Ball(), True)
     assert list(found) == ["pieces"]
