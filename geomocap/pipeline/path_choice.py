@@ -73,7 +73,7 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
     if patches is not None:
         # what patches of single cameras leave uncovered is bulk of a hull of few cameras, and mostly no piece
         enough = SMALLEST_PIECE if patches.ray is None else LARGEST_BULK
-        if uncovered_fraction(geometry.points, patches.positions, piece_reach(geometry.points(0))) < enough:
+        if uncovered_fraction(geometry.points, patches.positions, piece_reach(_first_surface(geometry))) < enough:
             return {"patches": patches}
     anchors = None if tracked is None else _anchors(tracked, spacing)
     nodes = _follow_nodes(job, geometry, anchors)
@@ -118,8 +118,15 @@ def point_paths(job: Job, geometry: Geometry) -> MotionPaths | None:
 
 
 def path_spacing(geometry: Geometry) -> float:
-    """Distance of the paths that bodies are found from, metres: as if all over the surface."""
-    return even_spacing(geometry.points(0), SAMPLES)
+    """Distance of the paths that bodies are found from, metres, as if all over the surface; 0 without any surface."""
+    surface = _first_surface(geometry)
+    return even_spacing(surface, SAMPLES) if len(surface) else 0.0
+
+
+def _first_surface(geometry: Geometry) -> np.ndarray:
+    """Points of the first frame that has any, (M, 3), metres: the subject may come into view later."""
+    frames = map(geometry.points, range(len(geometry)))
+    return next((points for points in frames if len(points)), np.empty((0, 3)))
 
 
 def patch_paths(tracked: Trajectories, spacing: float) -> MotionPaths | None:

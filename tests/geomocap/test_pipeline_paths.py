@@ -75,6 +75,17 @@ def patches_of(tracks: np.ndarray) -> MotionPaths:
     return patches
 
 
+class Late(Ball):
+    """It comes into view in the second frame."""
+
+    def points(self, frame: int) -> np.ndarray:
+        return super().points(1) if frame else np.empty((0, 3))
+
+
+def test_spacing_where_the_subject_comes_later() -> None:
+    assert path_spacing(Late()) == pytest.approx(path_spacing(Ball()), rel=0.2)  # other points of the same surface
+
+
 def test_nodes_leave_colours_alone(job):
     found = motion_paths(job("nodes"), Ball(), False)
     assert list(found) == ["nodes"]
@@ -118,9 +129,7 @@ def test_nodes_where_patches_are_there_for_a_while_only(job):
     tracks[:, 1:][tracks[:, 1:, 2] < 0] = np.nan  # 2 of 3 frames
     found = motion_paths(job("auto", tracks), Ball(), True)
     assert list(found) == ["pieces"]
-    patches = patch_paths(
-        Trajectories.of_positions(tracks, sigma=np.full(tracks.shape[:2], 0.002)), path_spacing(Ball())
-    )
+    patches = patches_of(tracks)
     nodes = found["pieces"].positions[patches.count :]
     assert 20 <= len(nodes) <= 40
     assert (np.nanmax(nodes[:, :, 2], axis=1) < 0.05).mean() > 0.85  # patches are there at random: few lie far apart
