@@ -68,7 +68,7 @@ def first_bodies(
     geodesics, radius = _wide_enough(graph, noise, max(settings.radius * diagonal, 2.5 * graph.spacing), first_cut)
     rotations = local_rotations(smooth, reference, weights, geodesics, radius)
     turns = turn_distances(_known_rotations(paths, rotations), certainty > _CERTAIN)
-    evidence = _evidence(smooth, weights, paths, reference, turns, graph, diagonal, settings)
+    evidence = _evidence(smooth, weights, paths, reference, turns, graph, noise, diagonal, settings)
     linkage = connected_linkage(turns, graph.neighbours)
     least = max(6, round(_EARLY_FRACTION * settings.min_fraction * paths.count))
     label = absorb_small(linkage.cut(first_cut) if paths.parts is None else paths.parts, turns, graph, least)
@@ -121,16 +121,19 @@ def _evidence(
     rest: np.ndarray,
     turns: np.ndarray,
     graph: SurfaceGraph,
+    noise: SurfaceNoise,
     diagonal: float,
     settings: MotionBodiesSettings,
 ) -> Evidence:
     near = csr_matrix(np.isfinite(graph.geodesics(max(settings.reach * diagonal, 3.0 * graph.spacing))).astype(float))
+    stated = paths.typical_sigma()
     certain = paths.seen[:, 0] if paths.ray is None else paths.seen[:, 0] & ~paths.ray[:, 0].any(axis=1)
     return Evidence(
         positions,
         weights,
         paths.seen,
-        paths.typical_sigma(),
+        # with a rigid part samples move alike, and show no noise
+        noise.calibrated(stated) if paths.parts is None else stated,
         paths.ray,
         rest,
         certain,

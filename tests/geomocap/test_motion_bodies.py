@@ -133,6 +133,26 @@ def test_more_noise_gives_no_more_bodies(three, shared):
     assert max(counts) == 3
 
 
+@pytest.mark.parametrize("stated", [0.002, 0.05])  # metres
+def test_standard_deviations_that_say_too_much_hide_no_bodies(three, stated):
+    positions = three.positions + np.random.default_rng(6).normal(scale=0.002, size=three.positions.shape)
+    bodies = find_motion_bodies(MotionPaths(positions, sigma=np.full(len(positions), stated)))
+    assert same_partition(bodies.label, three.body) > 0.97
+
+
+def test_what_is_stated_counts_on_the_scale_that_the_surface_shows(three):
+    graph = surface_graph(three.positions, three.positions[:, 0], 10, 2.0)
+    positions = three.positions + np.random.default_rng(3).normal(scale=0.004, size=three.positions.shape)
+    weights = np.ones(positions.shape[:2])
+    noise = surface_noise(positions, weights, three.positions[:, 0], None, graph, 1.2)
+    near = np.random.default_rng(4).uniform(0.001, 0.008, len(positions))
+    np.testing.assert_array_equal(noise.calibrated(near), near)
+    far = 10.0 * near
+    np.testing.assert_allclose(noise.calibrated(far) / noise.calibrated(far)[0], near / near[0])
+    assert np.quantile(noise.calibrated(far), 0.25) == pytest.approx(0.006, rel=0.3)
+    np.testing.assert_array_equal(noise.calibrated(0.0 * near), 0.0 * near)
+
+
 def test_misses_of_rings_are_those_of_numpy(three):
     rng = np.random.default_rng(11)
     positions = three.positions[:40] + rng.normal(scale=0.01, size=three.positions[:40].shape)
