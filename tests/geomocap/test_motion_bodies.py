@@ -149,6 +149,7 @@ def test_what_is_stated_counts_on_the_scale_that_the_surface_shows(three):
     np.testing.assert_array_equal(noise.calibrated(near), near)
     far = 10.0 * near
     np.testing.assert_allclose(noise.calibrated(far) / noise.calibrated(far)[0], near / near[0])
+    # half as much more than was added, which rings know to a third
     assert np.quantile(noise.calibrated(far), 0.25) == pytest.approx(0.006, rel=0.3)
     np.testing.assert_array_equal(noise.calibrated(0.0 * near), 0.0 * near)
 
