@@ -67,8 +67,8 @@ def align_patches(
         Patches to align.
     X, Q : (N, 3), (N, 3, 3) float
         Places at the start; replaced by those found.
-    patches : curvature (N, 3), size, radius, rows (N,), templates (R, C, L, M, 3), usable (R, C, M), doubt (N, C)
-        Arrays of `Patches` and of their store, which may have one camera for all. Steps are limited in units of size.
+    patches : curvature (N, 3), size, radius (N,), slots (N, C), templates (S, L, M, 3), usable (S, M), doubt (N, C)
+        Arrays of `Patches` and of their store. Steps are limited in units of size.
     use : (N, C) uint8
         Cameras to align with.
     views : images (C, H, W) float32, masks (C, H, W) uint8, projections (C, 3, 4), centers (C, 3)
@@ -90,10 +90,10 @@ def align_patches(
     covariance : (N, 6) float
         Filled: variances of shift (m²) and turn (rad²) along the patch's own axes; NaN without solution.
     """
-    curvature, size, radius, rows, templates, usable, doubt = patches
+    curvature, size, radius, slots, templates, usable, doubt = patches
     images, masks, P, centers = views
     prior_X, prior_Q, prior_shift, prior_turn = prior
-    M = templates.shape[3]
+    M = templates.shape[2]
     shape = np.empty((M, 5))
     C = use.shape[1]
     A = np.empty((C, 3, 4))
@@ -128,8 +128,8 @@ def align_patches(
                 local[r] = 0.0
                 for k in range(3):
                     local[r] += q_n[k, r] * (centers[c, k] - x_n[k])
-            own = min(c, templates.shape[1] - 1)  # all cameras may share one template
-            seen_by = templates[rows[n], own, level], usable[rows[n], own], masks[c], use_mask
+            slot = slots[n, c]
+            seen_by = templates[slot, level], usable[slot], masks[c], use_mask
             filled = places[c], J[c], T[c], moments
             counts[c] = choose_samples(A[c], local, shape, *seen_by, iterations > 0, stride, *filled)
             if counts[c] == 0:

@@ -71,15 +71,15 @@ def image_precision(patches: Patches, which: np.ndarray, camera: np.ndarray, cor
     """
     result = np.empty(len(which))
     store = patches.store
-    arrays = store.templates, store.usable, patches.rows[which], camera, correlation, result
+    arrays = store.templates, store.usable, patches.slots[which, camera], correlation, result
     spread(_image_precision, len(which), *arrays)
     return result
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _image_precision(begin, end, templates, usable, rows, camera, correlation, result):
+def _image_precision(begin, end, templates, usable, slots, correlation, result):
     for n in range(begin, end):
-        template, has = templates[rows[n], camera[n], -1], usable[rows[n], camera[n]]
+        template, has = templates[slots[n], -1], usable[slots[n]]
         count, sums, products = 0, np.zeros(3), np.zeros((3, 3))
         for m in range(len(has)):
             if has[m]:

@@ -211,7 +211,7 @@ def renewed(patches: Patches, found: PatchAlignment, good: np.ndarray, view: Fra
     stale = patches.has & good[:, None] & (found.by_camera > -1)
     if templates == "updated":
         stale &= found.by_camera < _NEW_TEMPLATE_CORRELATION
-    return with_templates(replace(patches, has=patches.has & ~stale), stale, view, found.image_sigma)
+    return with_templates(replace(patches, slots=np.where(stale, -1, patches.slots)), stale, view, found.image_sigma)
 
 
 def new_views(patches: Patches, found: PatchAlignment, good: np.ndarray, view: FrameViews, slack_px: float) -> Patches:

@@ -83,7 +83,7 @@ def turn_by(Q, w0, w1, w2, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def take_templates(begin, end, X, Q, form, rows, want, levels, masks, P, templates, usable):
+def take_templates(begin, end, X, Q, form, slots, want, levels, masks, P, templates, usable):
     """Take templates of patches in the cameras where `want` is 1.
 
     Parameters
@@ -92,34 +92,34 @@ def take_templates(begin, end, X, Q, form, rows, want, levels, masks, P, templat
         Places of the patches.
     form : curvature (N, 3), size (N,), radius (N,)
         Of the patches, see `fill_samples`.
-    rows : (N,) int
-        Where the patches have their templates.
+    slots : (N, C) int
+        Where the templates are to be.
     want : (N, C) uint8
         Set to 0 where too little is seen or the texture is too weak.
     levels : (L, C, H, W) float32
     masks : (C, H, W) uint8
     P : (C, 3, 4) float
-    templates : (R, C, L, M, 3) float32
+    templates : (S, L, M, 3) float32
         Filled with grey level and its slopes along s and t, per metre.
-    usable : (R, C, M) uint8
+    usable : (S, M) uint8
         Filled with 1 where the sample was seen.
     """
     C = want.shape[1]
     L = levels.shape[0]
     H, W = masks.shape[1:]
-    M = templates.shape[3]
+    M = templates.shape[2]
     A, shape = np.empty((3, 4)), np.empty((M, 5))
     curvature, size, radius = form
     for n in range(begin, end):
-        row = rows[n]
         fill_samples(curvature[n], size[n], radius[n], shape)
         for c in range(C):
             if not want[n, c]:
                 continue
+            slot = slots[n, c]
             local_camera(P[c], X[n], Q[n], A)
             count, offered, total, square = 0, 0, 0.0, 0.0
             for q in range(M):
-                usable[row, c, q] = 0
+                usable[slot, q] = 0
                 if np.isnan(shape[q, 0]):
                     continue
                 offered += 1
@@ -133,7 +133,7 @@ def take_templates(begin, end, X, Q, form, rows, want, levels, masks, P, templat
                     continue
                 if masks[c, int(y + 0.5), int(x + 0.5)] == 0:
                     continue
-                usable[row, c, q] = 1
+                usable[slot, q] = 1
                 count += 1
                 # derivatives of the pixel by s, t, z
                 xs, ys = (A[0, 0] - x * A[2, 0]) / w, (A[1, 0] - y * A[2, 0]) / w
@@ -144,10 +144,10 @@ def take_templates(begin, end, X, Q, form, rows, want, levels, masks, P, templat
                     value = bilinear(image, x, y)
                     gx = bilinear(image, x + 0.5, y) - bilinear(image, x - 0.5, y)
                     gy = bilinear(image, x, y + 0.5) - bilinear(image, x, y - 0.5)
-                    templates[row, c, level, q, 0] = value
-                    templates[row, c, level, q, 1] = gx * (xs + zs * xz) + gy * (ys + zs * yz)
-                    templates[row, c, level, q, 2] = gx * (xt + zt * xz) + gy * (yt + zt * yz)
-                value = templates[row, c, L - 1, q, 0]
+                    templates[slot, level, q, 0] = value
+                    templates[slot, level, q, 1] = gx * (xs + zs * xz) + gy * (ys + zs * yz)
+                    templates[slot, level, q, 2] = gx * (xt + zt * xz) + gy * (yt + zt * yz)
+                value = templates[slot, L - 1, q, 0]
                 total += value
                 square += value * value
             if count < max(LEAST_SAMPLES * offered, 1) or square / count - (total / count) ** 2 < LEAST_VARIANCE:

@@ -155,9 +155,7 @@ def _taken(state: Followed | None) -> tuple[np.ndarray, np.ndarray]:
 def _bare(seeds: Followed) -> Followed:
     """Leave out the templates, which are taken again from the same frame: only who has one is kept."""
     patches = seeds.patches
-    cameras, levels = patches.store.templates.shape[1:3]
-    blank = TemplateStore.blank(len(patches), cameras, levels, 0)
-    bare = replace(patches, rows=np.arange(len(patches)), store=blank)
+    bare = replace(patches, store=TemplateStore.empty(patches.store.templates.shape[1], 0))
     return Followed.begin(bare, seeds.identity, seeds.by_one)
 
 

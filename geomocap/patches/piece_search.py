@@ -67,7 +67,7 @@ def free_places(taken: np.ndarray, patches: Patches, view: FrameViews, spacing: 
     free = view.surface
     if len(taken):
         free = free[cKDTree(taken).query(free)[0] > _FREE * spacing]
-    C, (L, M) = view.count, patches.store.templates.shape[2:4]
+    C, (L, M) = view.count, patches.store.templates.shape[1:3]
     room = M, C, L
     if not len(free):
         return Patches.empty(room)

@@ -13,10 +13,10 @@ _MATCHES, _MATCHES_OF_ANGLE = 100_000, 20_000  # and most pairs of them
 
 def textures_of(patches: Patches) -> np.ndarray:
     """Blurred textures (N, M) of patches as the first camera with a template saw them; its mean where it saw none."""
-    camera = patches.has.argmax(axis=1)
-    texture = patches.store.templates[patches.rows, camera, 0, :, 0].astype(float)
-    usable = patches.store.usable[patches.rows, camera] != 0
-    middle = (texture * usable).sum(axis=1) / np.maximum(usable.sum(axis=1), 1)
+    slots = patches.slots[np.arange(len(patches)), patches.has.argmax(axis=1)]
+    usable = patches.store.usable[slots] != 0
+    texture = np.where(usable, patches.store.templates[slots, 0, :, 0], 0.0).astype(float)
+    middle = texture.sum(axis=1) / np.maximum(usable.sum(axis=1), 1)
     return np.where(usable, texture, middle[:, None])
 
 

@@ -15,7 +15,7 @@ from geomocap.scheduling import spread
 
 _FEW = 32  # patches that are not worth waking other threads for
 _COARSE_STRIDE = 2  # of the samples, on blurred levels
-_OWN = ("positions", "frames", "curvature", "size", "radius", "rows", "has", "hidden", "doubt")
+_OWN = ("positions", "frames", "curvature", "size", "radius", "slots", "hidden", "doubt")
 FACING_OTHERS = 0.35  # cosine from which a camera looks for what another one has seen
 SAME_SIDE = 0.5  # cosine between normals of patches on the same side of a limb
 
@@ -94,12 +94,10 @@ class Patches:
         Spacing of the samples: about a pixel, metres.
     radius : (N,) int
         Half the width in samples; narrow patches have fewer than M.
-    rows : (N,) int
-        Where each has its templates in the store.
+    slots : (N, C) int
+        Where each camera's template is in the store; −1: it has none.
     store : TemplateStore
         Shared with patches that these were selected from.
-    has : (N, C) bool
-        Cameras with a template.
     hidden : (N, C) float
         Depth of the patch beyond the (hull's) surface when its template was taken, metres; NaN where there is none.
     doubt : (N, C) float
@@ -111,9 +109,8 @@ class Patches:
     curvature: np.ndarray
     size: np.ndarray
     radius: np.ndarray
-    rows: np.ndarray
+    slots: np.ndarray
     store: TemplateStore
-    has: np.ndarray
     hidden: np.ndarray
     doubt: np.ndarray
 
@@ -144,9 +141,8 @@ class Patches:
             curvature,
             size,
             np.full(N, radius),
-            np.arange(N),
-            TemplateStore.blank(N, C, L, M),
-            np.zeros((N, C), bool),
+            np.full((N, C), -1),
+            TemplateStore.empty(L, M),
             np.full((N, C), np.nan),
             np.zeros((N, C)),
         )
@@ -162,13 +158,18 @@ class Patches:
     def join(self, other: Patches) -> Patches:
         """Return these followed by others; these share their store with the new ones from then on."""
         parts = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _OWN}
-        store, mine, others = self.store.join(self.rows, other.store, other.rows)
-        parts["rows"] = np.concatenate([mine, others])
+        store, mine, others = self.store.join(self.slots, other.store, other.slots)
+        parts["slots"] = np.concatenate([mine, others])
         return Patches(**parts, store=store)
 
     def moved(self, positions: np.ndarray, frames: np.ndarray) -> Patches:
         """Return them at other places."""
         return replace(self, positions=positions, frames=frames)
+
+    @property
+    def has(self) -> np.ndarray:
+        """Cameras with a template, (N, C) bool."""
+        return self.slots >= 0
 
     @property
     def normals(self) -> np.ndarray:
@@ -242,29 +243,35 @@ def facings(positions: np.ndarray, normals: np.ndarray, view: FrameViews) -> np.
 def with_templates(patches: Patches, want: np.ndarray, view: FrameViews, sigma: np.ndarray | None = None) -> Patches:
     """Take templates in the cameras `want` (N, C) bool that have none; where too little is seen there is none.
 
-    The new patches share their store with those given, see `TemplateStore`.
+    The new patches share their store with those given as long as it has room, see `TemplateStore`.
     `sigma` (N,): standard deviation of their places, metres; 0 if not given, as where patches begin.
     """
     took = np.ascontiguousarray(want & ~patches.has, np.uint8)
+    asked = np.count_nonzero(took)
+    store, slots = patches.store.with_room(patches.slots, asked)
+    slots = slots.copy()
+    slots[took != 0] = np.arange(store.used, store.used + asked)
+    store.used += asked
     spread(
         take_templates,
         len(took),
         patches.positions,
         patches.frames,
         (patches.curvature, patches.size, patches.radius),
-        patches.rows,
+        slots,
         took,
         view.levels,
         view.masks,
         view.projections,
-        patches.store.templates,
-        patches.store.usable,
+        store.templates,
+        store.usable,
     )
     got = took != 0
+    slots[want & ~patches.has & ~got] = -1
     depth, surface = view.depths(patches.positions)
     hidden = np.where(got, depth - surface, patches.hidden)
     doubt = np.where(got, 0.0 if sigma is None else sigma[:, None], patches.doubt)
-    return replace(patches, has=patches.has | got, hidden=hidden, doubt=doubt)
+    return replace(patches, slots=slots, store=store, hidden=hidden, doubt=doubt)
 
 
 def one_template(patches: Patches, view: FrameViews) -> tuple[Patches, np.ndarray]:
@@ -276,8 +283,8 @@ def one_template(patches: Patches, view: FrameViews) -> tuple[Patches, np.ndarra
 
 def as_one_camera(patches: Patches, camera: np.ndarray, has: np.ndarray) -> Patches:
     """Let the cameras `has` (N, C) look for what one camera, (N,) int, has seen of each patch."""
-    store, rows = patches.store.of_one_camera(patches.rows, camera)
-    return replace(patches, rows=rows, store=store, has=has)
+    own = patches.slots[np.arange(len(patches)), camera]
+    return replace(patches, slots=np.where(has, own[:, None], -1))
 
 
 def doubted(patches: Patches, found: PatchAlignment) -> PatchAlignment:
@@ -342,7 +349,7 @@ def align(
             which,
             X,
             Q,
-            (*form, patches.rows, patches.store.templates, patches.store.usable, patches.doubt),
+            (*form, patches.slots, patches.store.templates, patches.store.usable, patches.doubt),
             np.ascontiguousarray(use, np.uint8),
             (view.levels[level], view.masks, view.projections, view.centers),
             level,

@@ -6,24 +6,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_ROOM = 1.5  # of the rows in use, when a store is made anew: so each is copied about twice in all
+_ROOM = 1.5  # of the templates in use, when a store is made anew: so each is copied about twice in all
 
 
 @dataclass
 class TemplateStore:
-    """What cameras have seen of R patches. It changes in place, as copies of it would cost more than following patches.
+    """Templates of patches, each as one camera saw one patch: most cameras see nothing of a patch.
 
-    Patches share the store of those they were selected from, and know their rows in it. `with_templates` fills it where
-    the patches that it is given have no template; those who gave one up (`renewed`) are not used any more.
+    It changes in place, as copies of it would cost more than following patches. Patches share the store of those they
+    were selected from, and know where theirs are in it.
 
     Attributes
     ----------
-    templates : (R, C, L, M, 3) float32
-        Grey level and its slopes along s and t, for each camera and blur level; C = 1 where all cameras share one.
-    usable : (R, C, M) uint8
+    templates : (S, L, M, 3) float32
+        Grey level and its slopes along s and t, for each blur level.
+    usable : (S, M) uint8
         Samples that the template has.
     used : int
-        Rows from here on are room for others.
+        From here on is room for others.
     """
 
     templates: np.ndarray
@@ -31,54 +31,59 @@ class TemplateStore:
     used: int
 
     @classmethod
-    def blank(cls, rows: int, cameras: int, levels: int, samples: int) -> TemplateStore:
+    def empty(cls, levels: int, samples: int) -> TemplateStore:
         """Return a store without templates."""
-        templates = np.zeros((rows, cameras, levels, samples, 3), np.float32)
-        return cls(templates, np.zeros((rows, cameras, samples), np.uint8), rows)
+        return cls(np.empty((0, levels, samples, 3), np.float32), np.empty((0, samples), np.uint8), 0)
 
-    def join(
-        self, rows: np.ndarray, other: TemplateStore, other_rows: np.ndarray
-    ) -> tuple[TemplateStore, np.ndarray, np.ndarray]:
-        """Put some rows of another store behind those of this one.
+    def with_room(self, slots: np.ndarray, count: int) -> tuple[TemplateStore, np.ndarray]:
+        """Return a store that has room for `count` more templates, and where the others are in it.
 
-        There is room for more than was asked for: where it suffices only the new rows are copied, into this store.
-        Where it doesn't, both move to a larger store, without the rows that nobody uses any more.
+        It is this one as long as its room suffices; else a larger one, without the templates that nobody uses any more.
 
         Parameters
         ----------
-        rows : (N,) int
-            Rows of this store that are in use; the others may go.
+        slots : (N, C) int
+            Templates of this store that are in use, −1: none.
+        count : int
+        """
+        if self.used + count <= len(self.templates):
+            return self, slots
+        kept = slots[slots >= 0]
+        size = int(_ROOM * (len(kept) + count))
+        templates, usable = (np.empty((size, *a.shape[1:]), a.dtype) for a in (self.templates, self.usable))
+        larger = TemplateStore(templates, usable, 0)
+        moved = np.full_like(slots, -1)
+        moved[slots >= 0] = larger._append(self, kept)
+        return larger, moved
+
+    def join(
+        self, slots: np.ndarray, other: TemplateStore, other_slots: np.ndarray
+    ) -> tuple[TemplateStore, np.ndarray, np.ndarray]:
+        """Put templates of another store behind those of this one, or of a larger one.
+
+        Parameters
+        ----------
+        slots : (N, C) int
+            Templates of this store that are in use, −1: none; the others may go.
         other : TemplateStore
-        other_rows : (K,) int
+        other_slots : (K, C) int
 
         Returns
         -------
         store : TemplateStore
-        rows, other_rows : (N,), (K,) int
+        slots, other_slots : (N, C), (K, C) int
             Where they are in it.
         """
-        store, begin = self, self.used
-        if begin + len(other_rows) > len(self.templates):
-            begin = len(rows)
-            size = int(_ROOM * (begin + len(other_rows)))
-            templates, usable = (np.empty((size, *a.shape[1:]), a.dtype) for a in (self.templates, self.usable))
-            store = TemplateStore(templates, usable, begin)
-            store._write(0, self, rows)
-            rows = np.arange(begin)
-        store._write(begin, other, other_rows)
-        store.used = begin + len(other_rows)
-        return store, rows, np.arange(begin, store.used)
+        new = other_slots[other_slots >= 0]
+        store, slots = self.with_room(slots, len(new))
+        moved = np.full_like(other_slots, -1)
+        moved[other_slots >= 0] = store._append(other, new)
+        return store, slots, moved
 
-    def _write(self, begin: int, other: TemplateStore, rows: np.ndarray) -> None:
+    def _append(self, other: TemplateStore, slots: np.ndarray) -> np.ndarray:
+        """Copy templates of another store, (n,), behind those that are here; where they are then."""
+        begin, self.used = self.used, self.used + len(slots)
         for mine, new in ((self.templates, other.templates), (self.usable, other.usable)):
-            # "raise" would copy once more
-            np.take(new, rows, axis=0, out=mine[begin : begin + len(rows)], mode="clip")
-
-    def of_one_camera(self, rows: np.ndarray, camera: np.ndarray) -> tuple[TemplateStore, np.ndarray]:
-        """Return this store as one whose patches have a template for all cameras, and where (N,) those of `rows` are.
-
-        It is the one that a camera, (N,) int, has in each of the rows (N,). Nothing is copied: it is for looking only.
-        """
-        R, C = self.usable.shape[:2]
-        templates, usable = (a.reshape(R * C, 1, *a.shape[2:]) for a in (self.templates, self.usable))
-        return TemplateStore(templates, usable, self.used * C), rows * C + camera
+            if len(slots):  # "raise" would copy once more
+                np.take(new, slots, axis=0, out=mine[begin : self.used], mode="clip")
+        return np.arange(begin, self.used)
