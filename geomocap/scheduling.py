@@ -13,11 +13,13 @@ from typing import TypeVar
 
 import cv2
 import numba
+import numpy as np
 
 from geomocap.progress import Progress, silent
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Arrays = tuple[np.ndarray, ...]
 
 
 _PARTS = 8  # of a kernel's work for each thread, which takes the next one when it is ready
@@ -92,6 +94,17 @@ def map_here(function: Callable[[Item], Result], items: Sequence[Item]) -> list[
         return [function(item) for item in items]
     with threads(workers) as executor:
         return list(executor.map(function, items))
+
+
+def map_rows(function: Callable[[slice], Arrays], count: int) -> Arrays:
+    """Return the arrays of `function(rows)` of all rows of `range(count)`, on the cores that this thread may use.
+
+    No row may depend on another: parts of them are worked on side by side, and what they give is put together.
+    """
+    workers = max(1, min(numba.get_num_threads(), count))
+    borders = [count * k // workers for k in range(workers + 1)]
+    parts = map_here(function, [slice(a, b) for a, b in pairwise(borders)])
+    return tuple(np.concatenate(arrays) for arrays in zip(*parts, strict=True))
 
 
 def map_items(

@@ -165,9 +165,10 @@ class Companions:
 
     def _rows(self, identity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where the companions are among patches `identity`, and whether they are there, both (N, K)."""
-        order = np.argsort(identity)
-        rows = order[np.searchsorted(identity, self.identity, sorter=order).clip(0, len(identity) - 1)]
-        return rows, identity[rows] == self.identity
+        row = np.full(max(identity.max(initial=-1), self.identity.max(initial=-1)) + 2, -1)
+        row[identity] = np.arange(len(identity))
+        rows = row[self.identity]  # nobody is the last one, −1
+        return np.maximum(rows, 0), rows >= 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

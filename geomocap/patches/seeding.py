@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from numba import get_num_threads, njit
 from scipy.spatial import cKDTree
 
 from geomocap.patches.frame_views import FrameViews
@@ -11,6 +11,7 @@ from geomocap.patches.ghosts import nothing_behind
 from geomocap.patches.one_camera import image_precision
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.patches.surface_patches import FACING_OTHERS, Patches, align, as_one_camera, facings, with_templates
+from geomocap.scheduling import map_rows
 
 _FIT_VOXELS = 4.5  # radius of the piece of surface that gives a patch its shape, voxels
 _FACING_ALONE = 0.5  # of a camera that sees a patch alone
@@ -62,7 +63,7 @@ def spaced(points: np.ndarray, spacing: float, taken: np.ndarray, rng: np.random
     """Choose points (M, 3), `spacing` from each other and 0.9 of it from those `taken` (K, 3): indices, sorted."""
     free = np.ones(len(points), bool)
     if len(taken):
-        free = cKDTree(taken).query(points)[0] > 0.9 * spacing
+        free = cKDTree(taken).query(points, workers=get_num_threads())[0] > 0.9 * spacing
     order = rng.permutation(np.flatnonzero(free))
     if not len(order):
         return order
@@ -116,7 +117,16 @@ def surface_frames(view: FrameViews, points: np.ndarray) -> tuple[np.ndarray, np
     curvature : (N, 3) float
         a, b, c of z = a s² + b s t + c t², per metre.
     """
-    tree = cKDTree(view.surface)
+    tree, outward = cKDTree(view.surface), _outward(view, points)
+    positions, frames, curvature = map_rows(
+        lambda rows: _fitted_frames(view, tree, points[rows], outward[rows]), len(points)
+    )
+    return positions, frames, curvature
+
+
+def _fitted_frames(
+    view: FrameViews, tree: cKDTree, points: np.ndarray, outward: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     radius = _FIT_VOXELS * view.voxel_size
     count = min(round(np.pi * _FIT_VOXELS**2), len(view.surface))
     distance, near = tree.query(points, count)
@@ -125,7 +135,6 @@ def surface_frames(view: FrameViews, points: np.ndarray) -> tuple[np.ndarray, np
     middle = (away * inside).sum(axis=1) / inside.sum(axis=1)
     spread_out = (away - middle[:, None]) * inside
     normals = np.linalg.eigh(np.swapaxes(spread_out, 1, 2) @ spread_out)[1][:, :, 0]
-    outward = _outward(view, points)
     normals *= np.where(np.einsum("ni,ni->n", normals, outward) >= 0, 1.0, -1.0)[:, None]
     ridge = np.diag([0.0, 0, 0, 1, 1, 1]) * 0.05 * radius**4
     for _ in range(2):
@@ -170,7 +179,7 @@ def seed_patches(
     for radius in (wide, narrow, narrow):
         candidates = np.flatnonzero(~tried)
         # a hull stands off the true surface: what is there already counts where it shows on the hull
-        there = view.surface[tree.query(np.concatenate([taken, patches.positions]))[1]]
+        there = view.surface[tree.query(np.concatenate([taken, patches.positions]), workers=get_num_threads())[1]]
         chosen = candidates[spaced(view.surface[candidates], spacing, there, rng)]
         if not len(chosen):
             break

@@ -362,11 +362,13 @@ def align(
             covariance,
             few=_FEW,
         )
-    counted = correlation >= least_correlation
-    part = correlation > -1
-    mean = np.where(part, correlation, 0).sum(axis=1) / np.maximum(part.sum(axis=1), 1)
-    best = np.where(counted, correlation, 0).sum(axis=1) / np.maximum(counted.sum(axis=1), 1)
-    score = np.where(part.any(axis=1), np.where(counted.any(axis=1), best, mean), -1.0)
-    sigma = np.sqrt(covariance[:, :3].mean(axis=1))
-    sigma = np.where(np.isfinite(sigma), sigma, np.inf)
-    return PatchAlignment(X, Q, score, counted.sum(axis=1), sigma, sigma, correlation)
+    score, n_views, sigma = np.full(N, -1.0), np.zeros(N, int), np.full(N, np.inf)
+    asked = correlation[which]
+    counted, part = asked >= least_correlation, asked > -1
+    mean = np.where(part, asked, 0).sum(axis=1) / np.maximum(part.sum(axis=1), 1)
+    best = np.where(counted, asked, 0).sum(axis=1) / np.maximum(counted.sum(axis=1), 1)
+    score[which] = np.where(part.any(axis=1), np.where(counted.any(axis=1), best, mean), -1.0)
+    n_views[which] = counted.sum(axis=1)
+    found = np.sqrt(covariance[which, :3].mean(axis=1))
+    sigma[which] = np.where(np.isfinite(found), found, np.inf)
+    return PatchAlignment(X, Q, score, n_views, sigma, sigma, correlation)
