@@ -30,8 +30,8 @@ import numpy as np
 from numba import njit
 
 from geomocap.model.small_systems import cholesky, inverse_diagonal, solve
-from geomocap.patches.patch_samples import choose_samples, compare, sum_of_products
-from geomocap.patches.patch_templates import fill_samples, local_camera, set_place, turn_by
+from geomocap.patches.patch_samples import choose_samples, compare, normal_matrix
+from geomocap.patches.patch_templates import LANES, fill_samples, local_camera, set_place, turn_by
 
 _FLOOR = 1.0  # noise of an image that even a perfect fit is granted, grey levels
 COHERENT = 0.15  # fraction of the samples over which residuals beyond that go together
@@ -94,26 +94,30 @@ def align_patches(
     images, masks, P, centers = views
     prior_X, prior_Q, prior_shift, prior_turn = prior
     M = templates.shape[2]
-    shape = np.empty((M, 5))
-    C = use.shape[1]
-    A = np.empty((C, 3, 4))
-    J = np.empty((C, 6, M), np.float32)
-    T = np.empty((C, M), np.float32)
-    places = np.empty((C, 3, M))
-    at = np.empty(M, np.int32)
-    aside, below, values = np.empty(M, np.float32), np.empty(M, np.float32), np.empty(M, np.float32)
+    C, side = use.shape[1], int(math.sqrt(M) + 0.5)
+    most = (M + stride - 1) // stride + LANES
+    laid_out, index = np.empty((5, most)), np.empty(most, np.int64)
+    shape, room, at = np.empty((5, most), np.float32), np.empty((5, most), np.float32), np.empty(most, np.int32)
+    shown, T, J = (
+        np.empty((C, most), np.float32),
+        np.empty((C, most), np.float32),
+        np.empty((C, 6, most), np.float32),
+    )
+    camera, A, local = np.empty((3, 4)), np.empty((C, 3, 4), np.float32), np.empty(3, np.float32)
     counts = np.empty(C, np.int64)
-    variance_t = np.empty(C)
+    moments = np.empty((C, 14))
     H = np.empty((C, 6, 6))
     b = np.empty((C, 6))
-    moments = np.empty(1)
     weights, gains, now = np.empty(C), np.empty(C), np.empty(C)
     N6, L6 = np.zeros((6, 6)), np.zeros((6, 6))
-    r6, x6, local = np.empty(6), np.empty(6), np.empty(3)
+    r6, x6 = np.empty(6), np.empty(6)
     x_n, q_n, q_new = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     best_x, best_q = np.empty(3), np.empty((3, 3))
     for n in which[begin:end]:
-        fill_samples(curvature[n], size[n], radius[n], shape)
+        N = fill_samples(curvature[n], size[n], radius[n], side, stride, laid_out, index)
+        for r in range(5):
+            for k in range(N):
+                shape[r, k] = laid_out[r, k]
         set_place(x_n, q_n, X[n], Q[n])
         set_place(best_x, best_q, x_n, q_n)
         best = -2.0
@@ -123,23 +127,22 @@ def align_patches(
             counts[c] = 0
             if not use[n, c]:
                 continue
-            local_camera(P[c], x_n, q_n, A[c])
+            local_camera(P[c], x_n, q_n, camera)
+            A[c] = camera
             for r in range(3):
-                local[r] = 0.0
+                to = 0.0
                 for k in range(3):
-                    local[r] += q_n[k, r] * (centers[c, k] - x_n[k])
+                    to += q_n[k, r] * (centers[c, k] - x_n[k])
+                local[r] = to
             slot = slots[n, c]
-            seen_by = templates[slot, level], usable[slot], masks[c], use_mask
-            filled = places[c], J[c], T[c], moments
-            counts[c] = choose_samples(A[c], local, shape, *seen_by, iterations > 0, stride, *filled)
+            seen_by = templates[slot, level], usable[slot], masks[c], use_mask, iterations > 0
+            filled = room, shown[c], J[c], T[c], moments[c]
+            counts[c] = choose_samples(N, A[c], local, shape, index, *seen_by, *filled)
             if counts[c] == 0:
                 continue
             seen += 1
-            variance_t[c] = moments[0]
             if iterations > 0:
-                for r in range(6):
-                    for k in range(r + 1):
-                        H[c, r, k] = sum_of_products(J[c, r], J[c, k], counts[c])
+                normal_matrix(N, J[c], moments[c], counts[c], H[c])
         for r in range(6):
             covariance[n, r] = np.nan
         if seen == 0:
@@ -150,13 +153,16 @@ def align_patches(
                 if counts[c] == 0:
                     continue
                 if step > 0:
-                    local_camera(P[c], x_n, q_n, A[c])
+                    local_camera(P[c], x_n, q_n, camera)
+                    A[c] = camera
+                known = J[c], T[c], moments[c]
                 product, variance = compare(
-                    A[c], places[c], images[c], counts[c], iterations > 0, J[c], T[c], b[c], at, aside, below, values
+                    N, A[c], shape, shown[c], images[c], counts[c], iterations > 0, *known, b[c], at, room
                 )
-                now[c] = product / math.sqrt(max(variance, 1e-3) * variance_t[c])
+                variance_t = moments[c, 0]
+                now[c] = product / math.sqrt(max(variance, 1e-3) * variance_t)
                 gains[c] = min(max(product / max(variance, 1e-3), 1 / _GAIN), _GAIN)
-                residual = max(variance_t[c] * (1 - now[c] * abs(now[c])), 0.0)
+                residual = max(variance_t * (1 - now[c] * abs(now[c])), 0.0)
                 misfit = residual * counts[c] / max(counts[c] - 8, 1)
                 weights[c] = 1 / (misfit * max(COHERENT * counts[c], 1.0) + _FLOOR**2)
                 if iterations > 0:

@@ -13,6 +13,9 @@ LEAST_SAMPLES = 0.6
 LEAST_VARIANCE = 0.5
 """Least variance of the grey levels under a patch."""
 
+LANES = 32
+"""Samples that are worked on at once, in vectors of eight."""
+
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def bilinear(image, x, y):
@@ -25,24 +28,40 @@ def bilinear(image, x, y):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_samples(curvature, size, radius, samples):
-    """Lay out a patch on a square grid: `samples` (M, 5) s, t, z (m), ∂z/∂s, ∂z/∂t; NaN beyond `radius` steps.
+def fill_samples(curvature, size, radius, side, stride, samples, index):
+    """Lay out a patch on a square grid; returns the number of samples, a multiple of `LANES`.
 
+    Parameters
+    ----------
     curvature : (3,) float
         a, b, c of z = a s² + b s t + c t², per metre.
     size : float, metres
         Of a step.
+    radius : int
+        Steps from the middle to each side.
+    side : int
+        Of the grid that templates are on; it has as many columns.
+    stride : int
+        Every so many places of the grid are samples; of two, a chequerboard.
+    samples : (5, N) float
+        Filled: s, t, z (m), ∂z/∂s, ∂z/∂t.
+    index : (N,) int
+        Filled: places in the template; −1: no sample, but one in the middle that nobody sees.
     """
-    side = int(math.sqrt(len(samples)) + 0.5)
     a, b, c = curvature
-    for q in range(len(samples)):
-        i, j = q % side - side // 2, q // side - side // 2
-        if abs(i) > radius or abs(j) > radius:
-            samples[q] = np.nan
-            continue
+    count, width = 0, 2 * radius + 1
+    for k in range(0, width * width, stride):
+        i, j = k % width - radius, k // width - radius
         s, t = size * i, size * j
-        samples[q, 0], samples[q, 1], samples[q, 2] = s, t, a * s * s + b * s * t + c * t * t
-        samples[q, 3], samples[q, 4] = 2 * a * s + b * t, b * s + 2 * c * t
+        samples[0, count], samples[1, count], samples[2, count] = s, t, a * s * s + b * s * t + c * t * t
+        samples[3, count], samples[4, count] = 2 * a * s + b * t, b * s + 2 * c * t
+        index[count] = (j + side // 2) * side + i + side // 2
+        count += 1
+    while count % LANES:
+        samples[:, count] = 0.0
+        index[count] = -1
+        count += 1
+    return count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -108,22 +127,24 @@ def take_templates(begin, end, X, Q, form, slots, want, levels, masks, P, templa
     L = levels.shape[0]
     H, W = masks.shape[1:]
     M = templates.shape[2]
-    A, shape = np.empty((3, 4)), np.empty((M, 5))
+    side = int(math.sqrt(M) + 0.5)
+    A, shape, index = np.empty((3, 4)), np.empty((5, M + LANES)), np.empty(M + LANES, np.int64)
     curvature, size, radius = form
     for n in range(begin, end):
-        fill_samples(curvature[n], size[n], radius[n], shape)
+        samples = fill_samples(curvature[n], size[n], radius[n], side, 1, shape, index)
         for c in range(C):
             if not want[n, c]:
                 continue
             slot = slots[n, c]
             local_camera(P[c], X[n], Q[n], A)
             count, offered, total, square = 0, 0, 0.0, 0.0
-            for q in range(M):
-                usable[slot, q] = 0
-                if np.isnan(shape[q, 0]):
+            usable[slot] = 0
+            for k in range(samples):
+                q = index[k]
+                if q < 0:
                     continue
                 offered += 1
-                s, t, z, zs, zt = shape[q, 0], shape[q, 1], shape[q, 2], shape[q, 3], shape[q, 4]
+                s, t, z, zs, zt = shape[0, k], shape[1, k], shape[2, k], shape[3, k], shape[4, k]
                 w = A[2, 0] * s + A[2, 1] * t + A[2, 2] * z + A[2, 3]
                 if w <= 0:
                     continue
