@@ -247,7 +247,7 @@ def with_templates(patches: Patches, want: np.ndarray, view: FrameViews, sigma: 
     `sigma` (N,): standard deviation of their places, metres; 0 if not given, as where patches begin.
     """
     took = np.ascontiguousarray(want & ~patches.has, np.uint8)
-    asked = np.count_nonzero(took)
+    asked = int(np.count_nonzero(took))
     store, slots = patches.store.with_room(patches.slots, asked)
     slots = slots.copy()
     slots[took != 0] = np.arange(store.used, store.used + asked)

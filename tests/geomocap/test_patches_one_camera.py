@@ -63,7 +63,8 @@ def test_precision_is_that_of_least_squares_in_two_dimensions(views):
     assert (seeds.has.sum(axis=1) == 1).all()
     got = image_precision(seeds, np.arange(len(seeds)), camera, np.full(len(seeds), 0.95))
     for n in range(len(seeds)):
-        template = seeds.store.templates[n, camera[n], -1][seeds.store.usable[n, camera[n]] != 0].astype(float)
+        slot = seeds.slots[n, camera[n]]
+        template = seeds.store.templates[slot, -1][seeds.store.usable[slot] != 0].astype(float)
         A = template[:, 1:] - template[:, 1:].mean(axis=0)
         residual = template[:, 0].var() * (1 - 0.95**2) * 0.15 * len(template) + 4
         expected = np.sqrt(np.linalg.eigvalsh(residual * np.linalg.inv(A.T @ A))[-1])

@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 from geomocap.model.small_systems import inverse_diagonal
 from geomocap.model.trajectories import REASONS
 from geomocap.patches.alignment_kernel import align_patches
+from geomocap.patches.patch_samples import choose_samples, compare, normal_matrix
 from geomocap.patches.patch_search import renewed
 from geomocap.patches.patch_settings import TrackingSettings
-from geomocap.patches.patch_templates import fill_samples
+from geomocap.patches.patch_templates import LANES, fill_samples, local_camera
 from geomocap.patches.patch_tracking import track_surface
 from geomocap.patches.seeding import (
     image_reduction,
@@ -59,26 +60,40 @@ def test_patches_are_as_wide_as_their_distance_within_bounds(views):
     assert patch_radii(views[0], pixel, TrackingSettings(radius_px=2)) == (2, 2)
 
 
-def samples_of(curvature, size, radius, most):
-    samples = np.empty(((2 * most + 1) ** 2, 5))
-    fill_samples(np.asarray(curvature), size, radius, samples)
-    return samples
+def samples_of(curvature, size, radius, most, stride=1):
+    """Samples (n, 5) and their places in a template of half the width `most`, (n,)."""
+    room = (2 * most + 1) ** 2 + LANES
+    samples, index = np.empty((5, room)), np.empty(room, int)
+    count = fill_samples(np.asarray(curvature), size, radius, 2 * most + 1, stride, samples, index)
+    assert count % LANES == 0
+    there = index[:count] >= 0
+    assert there[: there.sum()].all() and not samples[:, :count][:, ~there].any()
+    return samples[:, :count][:, there].T, index[:count][there]
 
 
 def test_narrow_patches_have_the_middle_samples_of_wide_ones():
     curvature, size = [-3.0, 1.0, -2.0], 0.002
-    wide, narrow, full = (samples_of(curvature, size, *r) for r in ((2, 4), (2, 2), (4, 4)))
-    middle = wide.reshape(9, 9, 5)[2:-2, 2:-2].reshape(25, 5)
-    assert_array_equal(middle, narrow)
-    assert_array_equal(middle, full.reshape(9, 9, 5)[2:-2, 2:-2].reshape(25, 5))
-    assert np.isnan(wide).all(axis=1).sum() == 81 - 25
+    (wide, place), (narrow, own), (full, every) = (samples_of(curvature, size, *r) for r in ((2, 4), (2, 2), (4, 4)))
+    assert_array_equal(wide, narrow)
+    assert_array_equal(own, np.arange(25))
+    assert_array_equal(every, np.arange(81))
+    assert_array_equal(place, np.arange(81).reshape(9, 9)[2:-2, 2:-2].ravel())
+    assert_array_equal(wide, full[place])
+
+
+@pytest.mark.parametrize("radius", [2, 3, 4])
+def test_every_second_sample_is_that_of_a_chequerboard(radius):
+    samples, place = samples_of([-3.0, 1.0, -2.0], 0.002, radius, 4, stride=2)
+    i, j = np.rint(samples[:, :2].T / 0.002).astype(int)
+    assert not ((i + j) % 2).any() and len(samples) == ((2 * radius + 1) ** 2 + 1) // 2
+    assert_array_equal(place, 9 * (j + 4) + i + 4)
 
 
 def test_samples_lie_on_a_paraboloid_row_by_row():
     (a, b, c), size = (-3.0, 1.0, -2.0), 0.002
     s, t = (size * g.ravel() for g in np.meshgrid(np.arange(-3, 4), np.arange(-3, 4)))
     expected = [s, t, a * s * s + b * s * t + c * t * t, 2 * a * s + b * t, b * s + 2 * c * t]
-    assert_array_equal(samples_of((a, b, c), size, 3, 3), np.stack(expected, axis=1))
+    assert_array_equal(samples_of((a, b, c), size, 3, 3)[0], np.stack(expected, axis=1))
 
 
 def test_spaced_points_keep_distance_and_covers():
@@ -117,7 +132,7 @@ def test_surface_frames_follow_a_curved_surface(scene, views):
 
 
 def test_shape_and_slopes_belong_together():
-    grid = samples_of([-3.0, 1.0, -2.0], 0.002, 3, 3).reshape(7, 7, 5)
+    grid = samples_of([-3.0, 1.0, -2.0], 0.002, 3, 3)[0].reshape(7, 7, 5)
     assert_allclose(np.gradient(grid[:, :, 2], 0.002, axis=1)[:, 1:-1], grid[:, 1:-1, 3], atol=1e-12)
     assert_allclose(np.gradient(grid[:, :, 2], 0.002, axis=0)[1:-1], grid[1:-1, :, 4], atol=1e-12)
 
@@ -133,10 +148,70 @@ def test_seeds_lie_on_the_surface_with_two_cameras_each(scene, seeds):
 def test_templates_have_the_slopes_of_the_surface(scene, views, seeds):
     """The stored slopes are what grey levels change by along the patch."""
     n, c = 0, int(np.flatnonzero(seeds.has[0])[0])
-    template = seeds.store.templates[n, c, 0].reshape(9, 9, 3)
+    template = seeds.store.templates[seeds.slots[n, c], 0].reshape(9, 9, 3)
     step = seeds.size[n]
     along = (template[1:-1, 2:, 0] - template[1:-1, :-2, 0]) / (2 * step)
     assert np.corrcoef(along.ravel(), template[1:-1, 1:-1, 1].ravel())[0, 1] > 0.98
+
+
+def reference_sums(seeds, n, c, view, level, stride):
+    """What a step needs of one camera, in double precision: count, J̃ᵀJ̃, J̃ᵀI, cov(T, I), variances of T and of I."""
+    X, Q, slot = seeds.positions[n], seeds.frames[n], seeds.slots[n, c]
+    grid, place = samples_of(seeds.curvature[n], seeds.size[n], seeds.radius[n], 4, stride)
+    P = view.projections[c] @ np.vstack([np.c_[Q, X], [0, 0, 0, 1]])
+    arm = grid[:, :3] - Q.T @ (view.centers[c] - X)
+    facing = grid[:, 3] * arm[:, 0] + grid[:, 4] * arm[:, 1] - arm[:, 2]
+    steep = facing < 0.2 * np.linalg.norm(arm, axis=1) * np.sqrt(1 + (grid[:, 3:] ** 2).sum(axis=1))
+    h = np.c_[grid[:, :3], np.ones(len(grid))] @ P.T
+    x, y = h[:, 0] / h[:, 2], h[:, 1] / h[:, 2]
+    inside = view.masks[c, (y + 0.5).astype(int), (x + 0.5).astype(int)] != 0
+    good = (seeds.store.usable[slot, place] > 0) & ~steep & inside
+    grid, arm, facing, x, y, place = (a[good] for a in (grid, arm, facing, x, y, place))
+    T, Ts, Tt = seeds.store.templates[slot, level, place].astype(float).T
+    g2 = (Ts * arm[:, 0] + Tt * arm[:, 1]) / facing
+    g = np.stack([Ts - grid[:, 3] * g2, Tt - grid[:, 4] * g2, g2], axis=1)
+    J = np.c_[g, np.cross(grid[:, :3], g)]
+    T = T - T.mean()
+    J = J - J.mean(axis=0)
+    J -= np.outer(T, T @ J / (T @ T))
+    i, j = x.astype(int), y.astype(int)
+    a, b, image = x - i, y - j, view.levels[level, c].astype(float)
+    top, low = (image[r, i] * (1 - a) + image[r, i + 1] * a for r in (j, j + 1))
+    grey = top * (1 - b) + low * b
+    return len(T), J.T @ J, J.T @ grey, T @ grey / len(T), T.var(), grey.var()
+
+
+@pytest.mark.parametrize(("level", "stride"), [(0, 1), (0, 2), (1, 1), (1, 2)])
+def test_sums_of_a_camera_are_those_in_double_precision(views, seeds, level, stride):
+    view, room, compared = views[1], 81 + LANES, 0
+    for n in range(0, len(seeds), 5):
+        samples, index = np.empty((5, room)), np.empty(room, int)
+        N = fill_samples(seeds.curvature[n], seeds.size[n], seeds.radius[n], 9, stride, samples, index)
+        shape, free, seen, T = (np.empty(s, np.float32) for s in ((5, room), (5, room), room, room))
+        shape[:, :N] = samples[:, :N]
+        J, moments, H, b = np.empty((6, room), np.float32), np.empty(14), np.zeros((6, 6)), np.empty(6)
+        A = np.empty((3, 4))
+        for c in np.flatnonzero(seeds.has[n]):
+            local_camera(view.projections[c], seeds.positions[n], seeds.frames[n], A)
+            center = (view.centers[c] - seeds.positions[n]) @ seeds.frames[n]
+            placed = N, A.astype(np.float32), center.astype(np.float32), shape, index
+            slot = seeds.slots[n, c]
+            known = seeds.store.templates[slot, level], seeds.store.usable[slot], view.masks[c], True, True
+            count = choose_samples(*placed, *known, free, seen, J, T, moments)
+            if count == 0:
+                continue
+            compared += 1
+            normal_matrix(N, J, moments, count, H)
+            image = N, placed[1], shape, seen, view.levels[level, c], count, True, J, T, moments
+            product, variance = compare(*image, b, np.empty(room, np.int32), free)
+            number, normal, right, covariance, of_template, of_image = reference_sums(seeds, n, c, view, level, stride)
+            assert count == number
+            scale = np.sqrt(np.diag(normal))
+            assert_allclose((H + np.tril(H, -1).T) / np.outer(scale, scale), normal / np.outer(scale, scale), atol=1e-4)
+            assert_allclose(b / scale, right / scale, atol=1e-4 * np.sqrt(number * of_image))
+            assert_allclose([moments[0], variance], [of_template, of_image], rtol=1e-5)
+            assert_allclose(product, covariance, atol=1e-5 * np.sqrt(of_template * of_image))
+    assert compared > 20
 
 
 def moved(scene, seeds, frame):
@@ -171,10 +246,11 @@ def test_alignment_keeps_to_its_expectation_where_nothing_is_seen(scene, views, 
 
 def reference_step(patches, n, X, Q, view, level, size):
     """One Gauss–Newton step by numerical differentiation of the images themselves, offset and gain as unknowns."""
-    grid = samples_of(patches.curvature[n], patches.size[n], patches.radius[n], 4)
+    grid, place = samples_of(patches.curvature[n], patches.size[n], patches.radius[n], 4)
+    usable = patches.store.usable[:, place] > 0
 
     def sample(x, q, c):
-        p = grid[patches.store.usable[n, c] > 0, :3] @ q.T + x
+        p = grid[usable[patches.slots[n, c]], :3] @ q.T + x
         h = np.c_[p, np.ones(len(p))] @ view.projections[c].T
         u, v = h[:, 0] / h[:, 2], h[:, 1] / h[:, 2]
         i, j = u.astype(int), v.astype(int)
@@ -186,7 +262,8 @@ def reference_step(patches, n, X, Q, view, level, size):
 
     N, b = np.zeros((6, 6)), np.zeros(6)
     for c in np.flatnonzero(patches.has[n]):
-        T = patches.store.templates[n, c, level, patches.store.usable[n, c] > 0, 0].astype(float)
+        slot = patches.slots[n, c]
+        T = patches.store.templates[slot, level, place[usable[slot]], 0].astype(float)
         grey = sample(X, Q, c)
         J = np.empty((len(T), 6))
         for r in range(6):
@@ -272,6 +349,12 @@ def test_tracks_follow_the_true_surface(scene, views):
     assert set(tracks.reasons()) <= set(REASONS)
 
 
+def seen_by(patches):
+    """Grey levels (N, C, M) on the blurred level; what isn't usable, or without a template, is 0."""
+    usable = (patches.store.usable[patches.slots] > 0) & patches.has[:, :, None]
+    return np.where(usable, patches.store.templates[patches.slots, 0, :, 0], 0.0)
+
+
 @pytest.mark.parametrize(("templates", "fraction"), [("first", 0.0), ("updated", 0.5), ("previous", 1.0)])
 def test_templates_are_taken_again_as_asked(scene, views, seeds, templates, fraction):
     X, Q = moved(scene, seeds, 1)
@@ -281,7 +364,9 @@ def test_templates_are_taken_again_as_asked(scene, views, seeds, templates, frac
     found = replace(found, by_camera=np.where(found.by_camera > -1, fit, -1.0))
     good = every % 5 > 0
     again = renewed(deepcopy(seeds).moved(X, Q), found, good, views[1], templates)
-    changed = (again.store.templates[again.rows] != seeds.store.templates[seeds.rows]).any(axis=(2, 3, 4)) & seeds.has
+    assert_array_equal(again.has, seeds.has)
+    before, after = (seen_by(p) for p in (seeds, again))
+    changed = (before != after).any(axis=2) & seeds.has
     taken = changed.any(axis=1)
     assert not taken[~good].any()
     if templates == "updated":
@@ -314,7 +399,10 @@ def test_cameras_whose_templates_are_in_doubt_move_a_patch_less(scene, views, se
     away = {}
     for doubt in (0.0, 0.01):
         later = with_templates(
-            replace(copy, has=copy.has & ~astray).moved(X + beside, Q), astray, views[1], np.full(len(X), doubt)
+            replace(copy, slots=np.where(astray, -1, copy.slots)).moved(X + beside, Q),
+            astray,
+            views[1],
+            np.full(len(X), doubt),
         )
         found = align(later, rows, X, Q, later.has, views[1], iterations=(4, 10), least_correlation=0.0)
         along = np.einsum("ni,ni->n", found.positions - X, Q[:, :, 0])[rows]
@@ -346,25 +434,36 @@ def test_patches_can_be_selected_and_joined(seeds):
     assert with_templates(empty, np.zeros((0, 6), bool), MovingEllipsoid().view(0)).has.shape == (0, 6)
 
 
-def test_rows_are_put_into_the_same_store_while_there_is_room():
-    numbers = np.arange(20.0, dtype=np.float32)[:, None, None, None, None] * np.ones((1, 2, 1, 4, 3), np.float32)
-    parts = [TemplateStore(numbers[k : k + 2].copy(), np.full((2, 2, 4), k, np.uint8), 2) for k in range(0, 8, 2)]
-    store, rows, stores = parts[0], np.arange(2), []
+def test_templates_are_put_into_the_same_store_while_there_is_room():
+    numbers = np.arange(20.0, dtype=np.float32)[:, None, None, None] * np.ones((1, 4, 3), np.float32)
+    parts = [TemplateStore(numbers[k : k + 2].copy(), np.full((2, 4), k, np.uint8), 2) for k in range(0, 8, 2)]
+    store, slots, stores = parts[0], np.array([[0, -1], [-1, 1]]), []
     for part in parts[1:]:
-        store, old, new = store.join(rows, part, np.arange(2))
-        rows = np.append(old, new[0])  # the second one leaves
+        store, old, new = store.join(slots, part, np.array([[-1, 0], [1, -1]]))
+        slots = np.concatenate([old, new[:1]])  # the second one leaves
         stores.append(store)
-        assert_array_equal(store.templates[rows, 1, 0, 0, 0], [0, 1, 2, 4, 6][: len(rows)])
-        assert_array_equal(store.usable[rows, 1, 0], [0, 0, 2, 4, 6][: len(rows)])
+        assert_array_equal(slots >= 0, [[True, False], [False, True], *[[False, True]] * (len(slots) - 2)])
+        there = slots[slots >= 0]
+        assert_array_equal(store.templates[there, 0, 0, 0], [0, 1, 2, 4, 6][: len(there)])
+        assert_array_equal(store.usable[there, 0], [0, 0, 2, 4, 6][: len(there)])
     assert stores[1] is stores[0] and stores[2] is not stores[1]
     assert store.used == 6 and len(store.templates) == 9
+
+
+def test_patches_of_one_store_take_further_templates_without_harm_to_each_other(views, seeds):
+    nobody = replace(seeds, slots=np.full_like(seeds.slots, -1))
+    before = seen_by(seeds)
+    first, second = (with_templates(nobody.select(some), seeds.has[some], views[0]) for some in (slice(5), slice(5, 9)))
+    for patches, some in ((first, slice(5)), (second, slice(5, 9))):
+        assert_array_equal(seen_by(patches), before[some])
+    assert_array_equal(seen_by(seeds), before)
 
 
 def test_one_cameras_templates_serve_all_without_a_copy(views, seeds):
     camera = seeds.has.argmax(axis=1)
     shared = as_one_camera(seeds, camera, np.ones_like(seeds.has))
-    assert np.shares_memory(shared.store.templates, seeds.store.templates)
-    assert_array_equal(shared.store.templates[shared.rows, 0], seeds.store.templates[seeds.rows, camera])
+    assert shared.store is seeds.store
+    assert_array_equal(shared.slots, np.repeat(seeds.slots[np.arange(len(seeds)), camera][:, None], 6, axis=1))
     every, only = np.arange(len(seeds)), np.arange(seeds.has.shape[1]) == camera[:, None]
     places = seeds.positions + 0.002, seeds.frames
     one, own = (
