@@ -88,12 +88,15 @@ def _keep_apart(points, spacing, kept):
         x, y, z = points[n]
         a, b, c = int((x - low[0]) / spacing) + 1, int((y - low[1]) / spacing) + 1, int((z - low[2]) / spacing) + 1
         free = True
-        for cell in range(27):
+        for step in range(27):
+            cell = (13 + step) % 27  # its own first
             other = last[a + cell // 9 - 1, b + cell // 3 % 3 - 1, c + cell % 3 - 1]
             while free and other >= 0:
                 dx, dy, dz = points[other, 0] - x, points[other, 1] - y, points[other, 2] - z
                 free = dx * dx + dy * dy + dz * dz > spacing * spacing
                 other = before[other]
+            if not free:
+                break
         kept[n] = free
         if free:
             before[n] = last[a, b, c]

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geomocap.model.trajectories import REASONS, TOO_FAST, TOO_JERKY, TOO_SHORT, UNLIKE, PathDerivatives, Trajectories
+from geomocap.scheduling import map_here
 from geomocap.trajectories.trajectory_settings import FilterSettings
 
 _MOVING = 0.995  # fraction of all points whose speed and acceleration are certainly true
@@ -110,10 +111,11 @@ def departure(tracks: Trajectories, window: int) -> np.ndarray:
     N, T = tracks.positions.shape[:2]
     out = np.full((N, T), np.nan)
     measured = tracks.measured
-    for t in range(window, T):
+
+    def at(t: int) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         rows = np.flatnonzero(measured[:, t] & measured[:, t - window])
         if len(rows) <= _NEIGHBOURS:
-            continue
+            return None
         old, new = tracks.positions[rows, t - window], tracks.positions[rows, t]
         near = cKDTree(old).query(old, _NEIGHBOURS + 1)[1][:, 1:]
         turn = tracks.rotations[rows, t] @ np.swapaxes(tracks.rotations[rows, t - window], 1, 2)
@@ -121,8 +123,12 @@ def departure(tracks: Trajectories, window: int) -> np.ndarray:
         away = np.sort(np.linalg.norm(led - new[:, None], axis=2), axis=1)[:, _AGREEING - 1]
         # the frame farther from where a point was placed is the one in doubt
         later = np.abs(t - tracks.placed[rows]) >= np.abs(t - window - tracks.placed[rows])
-        frame = np.where(later, t, t - window)
-        out[rows, frame] = np.fmax(out[rows, frame], away)
+        return rows, np.where(later, t, t - window), away
+
+    for known in map_here(at, range(window, T)):
+        if known is not None:
+            rows, frame, away = known
+            out[rows, frame] = np.fmax(out[rows, frame], away)
     return out
 
 

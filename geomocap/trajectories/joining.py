@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from geomocap.model.rotations import nearest_rotation
 from geomocap.model.trajectories import Trajectories
+from geomocap.scheduling import map_here
 
 _NEAR = 0.75  # of the typical distance of neighbours: nearer than patches are placed
 _STEADY = 0.1  # of the same: how much the one may move against the other
@@ -41,7 +42,7 @@ def join_broken(tracks: Trajectories) -> Trajectories:
         i, j = int(keep[n]), int(give[n])
         if not (alive[i] and alive[j]):
             continue
-        has, other = np.isfinite(arrays["sigma"][i]), np.isfinite(arrays["sigma"][j])
+        has, other = measured[i].copy(), measured[j]
         common, extra = has & other, other & ~has
         if common.sum() < _COMMON:
             continue
@@ -52,6 +53,7 @@ def join_broken(tracks: Trajectories) -> Trajectories:
         if spread > _STEADY * typical:
             continue
         alive[j] = False
+        measured[i] |= extra
         between = nearest_rotation((np.swapaxes(turn[common], 1, 2) @ arrays["rotations"][i, common]).sum(axis=0))
         arrays["positions"][i, extra] = arrays["positions"][j, extra] + turn[extra] @ middle
         arrays["rotations"][i, extra] = turn[extra] @ between
@@ -75,10 +77,13 @@ def _typical_distance(tracks: Trajectories) -> float:
 
 def _near_pairs(tracks: Trajectories, distance: float) -> np.ndarray:
     """Pairs of trajectories that come nearer than `distance` in some frame, (P, 2) int, ascending."""
-    found = [np.zeros((0, 2), int)]
-    for t in range(tracks.n_frames):
-        rows = np.flatnonzero(tracks.measured[:, t])
-        if len(rows) > 1:
-            pairs = cKDTree(tracks.positions[rows, t]).query_pairs(distance, output_type="ndarray")
-            found.append(np.sort(rows[pairs], axis=1))
-    return np.unique(np.concatenate(found), axis=0)
+    measured = tracks.measured
+
+    def at(t: int) -> np.ndarray:
+        rows = np.flatnonzero(measured[:, t])
+        if len(rows) < 2:
+            return np.zeros((0, 2), int)
+        pairs = cKDTree(tracks.positions[rows, t]).query_pairs(distance, output_type="ndarray")
+        return np.sort(rows[pairs], axis=1)
+
+    return np.unique(np.concatenate([np.zeros((0, 2), int), *map_here(at, range(tracks.n_frames))]), axis=0)

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geomocap.model.trajectories import LOW_PRECISION, Trajectories
+from geomocap.scheduling import map_here
 
 _NEIGHBOURS = 12
 _EVERY = 3  # frames between two looks
@@ -78,8 +79,9 @@ def neighbour_misses(tracks: Trajectories) -> Misses:
     """Compare points with where the rigid motion of the nearest ones since they were placed leads, in some frames."""
     has = tracks.measured & ~tracks.ray.any(axis=2)
     turned = turns(tracks)
-    parts = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))]
-    for begin in np.unique(tracks.placed):
+
+    def placed_in(begin: int) -> list[tuple[np.ndarray, ...]]:
+        parts = []
         for frame in range(0, tracks.n_frames, _EVERY):
             there = np.flatnonzero(has[:, begin] & has[:, frame])
             new = there[tracks.placed[there] == begin]
@@ -93,6 +95,10 @@ def neighbour_misses(tracks: Trajectories) -> Misses:
             variance = tracks.sigma[new, frame] ** 2 + 2 * (tracks.sigma[near, frame] ** 2).mean(axis=1) / _NEIGHBOURS
             square = (miss**2).sum(axis=1) / variance
             parts.append((new, np.full(len(new), frame), square, turned[new, frame]))
+        return parts
+
+    parts = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))]
+    parts += [part for some in map_here(placed_in, np.unique(tracks.placed).tolist()) for part in some]
     return Misses(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from geomocap.errors import GeometryError
 from geomocap.model.trajectories import PathDerivatives
+from geomocap.scheduling import map_here
 from geomocap.trajectories.trajectory_settings import SmoothingSettings
 
 _REGULAR = 1e-9
@@ -57,13 +58,14 @@ def smooth_motion(
     value = np.where(known[:, :, None], positions, 0.0)
     out = np.full((2, N, T, 3), np.nan)
     std = np.full((2, N, T), np.nan)
-    square, freedom = 0.0, 0
-    for t in range(T):
+
+    def fit_at(t: int) -> tuple[float, int]:
+        """Fill in a frame; return the sum of squares of the residuals, and their degrees of freedom."""
         low, high = max(t - h, 0), min(t + h + 1, T)
         w = weight[:, low:high]
         rows = np.flatnonzero(measured[:, t] & ((w > 0).sum(axis=1) >= terms))
         if not len(rows):
-            continue
+            return 0.0, 0
         # time in units of the half width keeps the normal matrix well conditioned
         powers = ((np.arange(low, high) - t) / h)[:, None] ** np.arange(terms)
         normal = np.einsum("nk,ki,kj->nij", w[rows], powers, powers)
@@ -71,13 +73,16 @@ def smooth_motion(
         rule = np.linalg.solve(normal + _REGULAR * scale * np.eye(terms), np.einsum("nk,ki->nik", w[rows], powers))
         fit = rule @ value[rows, low:high]
         spread = np.sqrt(np.einsum("nik,nk->ni", rule**2, np.where(w[rows] > 0, 1 / np.maximum(w[rows], 1e-300), 0.0)))
-        if sigma is None:
-            miss = (value[rows, low:high] - powers @ fit) * (w[rows] > 0)[:, :, None]
-            square += float((miss**2).sum())
-            freedom += 3 * int((w[rows] > 0).sum() - terms * len(rows))
         for order, unit in enumerate((fps / h, 2 * (fps / h) ** 2)[: settings.degree]):
             out[order, rows, t] = unit * fit[:, 1 + order]
             std[order, rows, t] = unit * spread[:, 1 + order]
+        if sigma is not None:
+            return 0.0, 0
+        miss = (value[rows, low:high] - powers @ fit) * (w[rows] > 0)[:, :, None]
+        return float((miss**2).sum()), 3 * int((w[rows] > 0).sum() - terms * len(rows))
+
+    left = map_here(fit_at, range(T))
     if sigma is None:
+        square, freedom = sum(square for square, _ in left), sum(count for _, count in left)
         std *= np.sqrt(square / freedom) if freedom > 0 else np.nan
     return PathDerivatives(*out, *std)
