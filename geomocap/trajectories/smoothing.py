@@ -19,6 +19,7 @@ from geomocap.scheduling import map_here
 from geomocap.trajectories.trajectory_settings import SmoothingSettings
 
 _REGULAR = 1e-9
+_AT_ONCE = 2048  # paths
 
 
 def smooth_motion(
@@ -48,24 +49,48 @@ def smooth_motion(
         given = "none" if sigma is None else sigma.shape
         raise GeometryError(f"positions {positions.shape} and sigma {given}: expected (N, T, 3) and (N, T)")
     N, T = positions.shape[:2]
+    out, std = np.full((2, N, T, 3), np.nan, np.float32), np.full((2, N, T), np.nan, np.float32)
+
+    def smooth(rows: slice) -> tuple[float, int]:
+        given = None if sigma is None else sigma[rows]
+        return _smooth_some(positions[rows], given, fps, settings, out[:, rows], std[:, rows])
+
+    left = map_here(smooth, [slice(begin, begin + _AT_ONCE) for begin in range(0, N, _AT_ONCE)])
+    if sigma is None:
+        square, freedom = sum(square for square, _ in left), sum(count for _, count in left)
+        std *= np.sqrt(square / freedom) if freedom > 0 else np.nan
+    return PathDerivatives(*out, *std)
+
+
+def _smooth_some(
+    positions: np.ndarray,
+    sigma: np.ndarray | None,
+    fps: float,
+    settings: SmoothingSettings,
+    out: np.ndarray,
+    std: np.ndarray,
+) -> tuple[float, int]:
+    """Fill in derivatives (2, n, T, 3) of some paths and their standard deviations (2, n, T).
+
+    Without `sigma` these are of observations of standard deviation 1, and the sum of squares of the residuals and
+    their degrees of freedom are returned; else 0.
+    """
+    n, T = positions.shape[:2]
     h, terms = settings.half_width, settings.degree + 1
     measured = np.isfinite(positions).all(axis=2)
-    sd = np.ones((N, T))
+    sd = np.ones((n, T))
     if sigma is not None:
         sd = np.where(np.isfinite(sigma) & (sigma > 0), np.asarray(sigma, np.float64), np.nan)
     known = measured & np.isfinite(sd)
     weight = np.where(known, 1 / np.where(known, sd, 1.0) ** 2, 0.0)
     value = np.where(known[:, :, None], positions, 0.0)
-    out = np.full((2, N, T, 3), np.nan)
-    std = np.full((2, N, T), np.nan)
-
-    def fit_at(t: int) -> tuple[float, int]:
-        """Fill in a frame; return the sum of squares of the residuals, and their degrees of freedom."""
+    square, freedom = 0.0, 0
+    for t in range(T):
         low, high = max(t - h, 0), min(t + h + 1, T)
         w = weight[:, low:high]
         rows = np.flatnonzero(measured[:, t] & ((w > 0).sum(axis=1) >= terms))
         if not len(rows):
-            return 0.0, 0
+            continue
         # time in units of the half width keeps the normal matrix well conditioned
         powers = ((np.arange(low, high) - t) / h)[:, None] ** np.arange(terms)
         normal = np.einsum("nk,ki,kj->nij", w[rows], powers, powers)
@@ -73,16 +98,11 @@ def smooth_motion(
         rule = np.linalg.solve(normal + _REGULAR * scale * np.eye(terms), np.einsum("nk,ki->nik", w[rows], powers))
         fit = rule @ value[rows, low:high]
         spread = np.sqrt(np.einsum("nik,nk->ni", rule**2, np.where(w[rows] > 0, 1 / np.maximum(w[rows], 1e-300), 0.0)))
+        if sigma is None:
+            miss = (value[rows, low:high] - powers @ fit) * (w[rows] > 0)[:, :, None]
+            square += float((miss**2).sum())
+            freedom += 3 * int((w[rows] > 0).sum() - terms * len(rows))
         for order, unit in enumerate((fps / h, 2 * (fps / h) ** 2)[: settings.degree]):
             out[order, rows, t] = unit * fit[:, 1 + order]
             std[order, rows, t] = unit * spread[:, 1 + order]
-        if sigma is not None:
-            return 0.0, 0
-        miss = (value[rows, low:high] - powers @ fit) * (w[rows] > 0)[:, :, None]
-        return float((miss**2).sum()), 3 * int((w[rows] > 0).sum() - terms * len(rows))
-
-    left = map_here(fit_at, range(T))
-    if sigma is None:
-        square, freedom = sum(square for square, _ in left), sum(count for _, count in left)
-        std *= np.sqrt(square / freedom) if freedom > 0 else np.nan
-    return PathDerivatives(*out, *std)
+    return square, freedom
