@@ -24,6 +24,8 @@ REASONS = (
 )
 """Why a trajectory ends (or begins no earlier), by number."""
 
+_AT_ONCE = 2048  # rows that are moved
+
 LAST_FRAME, UNSEEN, LOW_CORRELATION, LOW_PRECISION, APART, TOO_FAST, TOO_JERKY, UNLIKE, TOO_SHORT, OUTSIDE, DOUBLE = (
     range(11)
 )
@@ -138,6 +140,13 @@ class Trajectories:
         """Return some of them, by a mask or by positions."""
         return Trajectories(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
+    def narrowed(self, which: np.ndarray) -> Trajectories:
+        """Return some of them, ascending positions, in the memory of these, which are of no use afterwards.
+
+        Long recordings have many trajectories: there is no room for both.
+        """
+        return Trajectories(**{f.name: _moved_up(getattr(self, f.name), which) for f in fields(self)})
+
     def clear(self, drop: np.ndarray) -> None:
         """Take away, in place, what was measured where `drop` (N, T) is true."""
         for values in (self.positions, self.rotations, self.sigma, self.correlation):
@@ -149,6 +158,16 @@ class Trajectories:
         """Count why the trajectories end."""
         found = Counter(int(r) for r in self.end_reason)
         return {REASONS[r]: found[r] for r in sorted(found)}
+
+
+def _moved_up(values: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """Rows `which`, ascending, of an array, moved to its beginning; a copy of them where it can't be written to."""
+    if not values.flags.writeable:
+        return values[which]
+    for begin in range(0, len(which), _AT_ONCE):
+        some = which[begin : begin + _AT_ONCE]
+        values[begin : begin + len(some)] = values[some]
+    return values[: len(which)]
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -82,15 +82,58 @@ def track_surface(
     if executor is None:
         with threads(1) as own:
             return track_surface(frames, n_frames, settings, progress, own)
-    rng = np.random.default_rng(settings.seed)
     record = TrackRecord(n_frames)
+    placed = _forward(_stream(frames, range(n_frames), executor, "track forward", progress), n_frames, settings, record)
+    last = max((k for k, s in placed.seeds.items() if len(s.patches)), default=0)
+    if settings.backward and last > 0:
+        back = range(last, -1, -1)
+        _backward(_stream(frames, back, executor, "track backward", progress), placed, record)
+    found = record.trajectories(placed.count)
+    if placed.by_one:
+        found = adjust_depths(found)
+    found = with_observed_precision(join_broken(found))
+    clear_unsure(found, _UNSURE * settings.sigma_px * placed.pixel)
+    return found
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """What was placed on the way forward.
+
+    Attributes
+    ----------
+    settings : TrackingSettings
+        With half the width that the widest patches have.
+    spacing, pixel : float, metres
+        Distance of patches, and what a pixel covers.
+    by_one : bool
+        Whether a single camera may follow a patch.
+    seeds : dict
+        New patches of frames, without templates.
+    count : int
+        Of all patches.
+    """
+
+    settings: TrackingSettings
+    spacing: float
+    pixel: float
+    by_one: bool
+    seeds: dict[int, Followed]
+    count: int
+
+
+def _forward(
+    views: Iterator[tuple[int, FrameViews]], n_frames: int, settings: TrackingSettings, record: TrackRecord
+) -> _Placed:
+    """Place patches where the surface has none, and follow all to the last frame."""
+    rng = np.random.default_rng(settings.seed)
     spacing = pixel = 0.0
     state: Followed | None = None
     seeds: dict[int, Followed] = {}
     previous = None
     by_one, every = False, 1
     count = 0
-    for k, view in _stream(frames, range(n_frames), executor, "track forward", progress):
+    for k, view in views:
         if state is None:
             spacing = seed_spacing(view, settings.n_patches)
             pixel = float(np.median(view.pixel_size(view.surface)))
@@ -120,22 +163,22 @@ def track_surface(
         previous = view
     if state is not None:
         record.ended(state.identity, state.last_reason, forward=True)
-    if settings.backward and max((k for k, s in seeds.items() if len(s.patches)), default=0) > 0:
-        last = max(k for k, s in seeds.items() if len(s.patches))
-        state = previous = None
-        for k, view in _stream(frames, range(last, -1, -1), executor, "track backward", progress):
-            if state is not None and previous is not None:
-                state = _next(state, previous, view, settings, record, k, spacing, forward=False)
-            if k > 0 and k in seeds:
-                fresh = _dressed(seeds[k], view, template_room(view, settings))
-                state = fresh if state is None else state.join(fresh)
-            previous = view
-        if state is not None:
-            record.ended(state.identity, state.last_reason, forward=False)
-    found = record.trajectories(count)
-    found = with_observed_precision(join_broken(adjust_depths(found) if by_one else found))
-    clear_unsure(found, _UNSURE * settings.sigma_px * pixel)
-    return found
+    return _Placed(settings, spacing, pixel, by_one, seeds, count)
+
+
+def _backward(views: Iterator[tuple[int, FrameViews]], placed: _Placed, record: TrackRecord) -> None:
+    """Follow patches of later frames back to the first one, or until older ones have long been beside them."""
+    settings = placed.settings
+    state = previous = None
+    for k, view in views:
+        if state is not None and previous is not None:
+            state = _next(state, previous, view, settings, record, k, placed.spacing, forward=False)
+        if k > 0 and k in placed.seeds:
+            fresh = _dressed(placed.seeds[k], view, template_room(view, settings))
+            state = fresh if state is None else state.join(fresh)
+        previous = view
+    if state is not None:
+        record.ended(state.identity, state.last_reason, forward=False)
 
 
 def _stream(

@@ -82,7 +82,7 @@ class TrackRecord:
         self._ends.append((forward, identity, reason))
 
     def trajectories(self, count: int) -> Trajectories:
-        """Return all `count` trajectories."""
+        """Return all `count` trajectories; what was collected is gone then."""
         T = self.n_frames
         # all but the positions in single precision: long recordings have many trajectories, each with all frames
         positions = np.full((count, T, 3), np.nan)
@@ -92,7 +92,8 @@ class TrackRecord:
         first, placed = np.zeros((count, 3, 3)), np.zeros(count, int)
         for frame, identity, frames in self._placed:
             first[identity], placed[identity] = frames, frame
-        for m in self._measured:
+        while self._measured:
+            m = self._measured.pop()
             positions[m.identity, m.frame] = m.positions
             rotations[m.identity, m.frame] = m.frames @ np.swapaxes(first[m.identity], 1, 2)
             sigma[m.identity, m.frame], correlation[m.identity, m.frame] = m.sigma, m.correlation

@@ -53,6 +53,8 @@ def filter_trajectories(
 ) -> Filtered:
     """Cut trajectories where they can't be true.
 
+    Those left are in the memory of `tracks`, which are of no use afterwards.
+
     Parameters
     ----------
     tracks : Trajectories
@@ -85,7 +87,7 @@ def filter_trajectories(
         cut[REASONS[reason]] = int((after | before).any(axis=1).sum())
     kept = np.flatnonzero(left.sum(axis=1) >= settings.least_frames)
     cut[REASONS[TOO_SHORT]] = len(tracks) - len(kept)
-    rest = replace(tracks, end_reason=end, begin_reason=begin).select(kept)
+    rest = replace(tracks, end_reason=end, begin_reason=begin).narrowed(kept)
     rest.clear(~left[kept])
     return Filtered(rest, kept, cut, fastest, acceleration, unlike)
 

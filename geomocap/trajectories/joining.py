@@ -65,7 +65,7 @@ def join_broken(tracks: Trajectories) -> Trajectories:
             arrays["end_reason"][i] = arrays["end_reason"][j]
         if len(ends) and ends[0] < np.flatnonzero(has)[0]:
             arrays["begin_reason"][i] = arrays["begin_reason"][j]
-    return tracks.select(alive)
+    return tracks.narrowed(np.flatnonzero(alive))
 
 
 def _typical_distance(tracks: Trajectories) -> float:

@@ -81,7 +81,7 @@ def neighbour_misses(tracks: Trajectories) -> Misses:
     turned = turns(tracks)
 
     def placed_in(begin: int) -> list[tuple[np.ndarray, ...]]:
-        parts = []
+        parts: list[tuple[np.ndarray, ...]] = []
         for frame in range(0, tracks.n_frames, _EVERY):
             there = np.flatnonzero(has[:, begin] & has[:, frame])
             new = there[tracks.placed[there] == begin]
@@ -97,7 +97,8 @@ def neighbour_misses(tracks: Trajectories) -> Misses:
             parts.append((new, np.full(len(new), frame), square, turned[new, frame]))
         return parts
 
-    parts = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))]
+    none = np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0)
+    parts: list[tuple[np.ndarray, ...]] = [none]
     parts += [part for some in map_here(placed_in, np.unique(tracks.placed).tolist()) for part in some]
     return Misses(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
