@@ -76,7 +76,7 @@ def held_together(
     """
     bodies = np.array([body, *neighbours.tolist()])
     together = _joint_costs(bodies, body, model, criterion, borders)
-    alone = together[1:, 1:] if without is None else _joint_costs(bodies[1:], body, without, criterion, borders)
+    alone = together[1:, 1:].copy() if without is None else _joint_costs(bodies[1:], body, without, criterion, borders)
     nats = 0.5 * _OF_A_JOINT * (tree_cost(alone) + together[1:, 0].min() - tree_cost(together))
     return round(float(nats), _DIGITS)
 
