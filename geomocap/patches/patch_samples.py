@@ -139,8 +139,9 @@ def compare(N, A, shape, seen, image, count, with_slopes, J, T, moments, b, at, 
         w = _ONE / (a20 * s + a21 * t + a22 * z + a23)
         x = (a00 * s + a01 * t + a02 * z + a03) * w
         y = (a10 * s + a11 * t + a12 * z + a13) * w
-        x = min(max(x, _ZERO), right)
-        y = min(max(y, _ZERO), bottom)
+        # what isn't a number is 0, too: no pixel outside is read
+        x, y = x if x > _ZERO else _ZERO, y if y > _ZERO else _ZERO
+        x, y = x if x < right else right, y if y < bottom else bottom
         column, row = np.int32(x), np.int32(y)
         at[k] = row * width + column
         aside[k] = x - _F4(column)

@@ -9,9 +9,10 @@ import threading
 
 import cv2
 import numba
+import numpy as np
 import pytest
 
-from geomocap.scheduling import limit_threads, map_items, spread, threads
+from geomocap.scheduling import limit_threads, map_items, map_rows, spread, threads
 
 
 def test_results_come_in_order_and_progress_is_told():
@@ -63,6 +64,13 @@ def test_parts_of_a_kernels_work_are_all_done_once(monkeypatch, workers, count, 
         assert names <= {threading.current_thread().name}
     else:
         assert len(names) <= workers and threading.current_thread().name not in names
+
+
+@pytest.mark.parametrize("count", [0, 1, 7])
+def test_rows_are_worked_on_in_parts_and_put_together(count):
+    numbers = np.arange(count)
+    double, square = map_rows(lambda rows: (2 * numbers[rows], numbers[rows] ** 2), count)
+    assert np.array_equal(double, 2 * numbers) and np.array_equal(square, numbers**2)
 
 
 def test_an_error_in_a_part_is_raised(monkeypatch):

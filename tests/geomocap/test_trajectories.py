@@ -1,3 +1,5 @@
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -41,6 +43,18 @@ def test_what_is_cleared_is_gone_and_only_there():
     assert not tracks.n_views[drop].any() and not tracks.ray[drop].any()
     assert_array_equal(tracks.positions[~drop], kept.positions[~drop])
     assert kept.lengths.tolist() == [4, 4]  # a selection is a copy
+
+
+@pytest.mark.parametrize("count", [60, 5000])
+def test_narrowed_tracks_are_those_selected_in_the_same_memory(count):
+    tracks = rigid_tracks(cloud(count), 4, [0.01, 0, 0], [0, 0, 2])
+    which = np.flatnonzero(np.random.default_rng(0).random(count) < 0.7)
+    expected, read_only = tracks.select(which), Trajectories.of_positions(tracks.positions.copy())
+    narrowed = tracks.narrowed(which)
+    for field in fields(Trajectories):
+        assert_array_equal(getattr(narrowed, field.name), getattr(expected, field.name))
+        assert np.shares_memory(getattr(narrowed, field.name), getattr(tracks, field.name))
+    assert np.isnan(read_only.narrowed(which).rotations).all()  # which has no memory of its own
 
 
 def test_shapes_are_checked():
