@@ -98,11 +98,8 @@ def align_patches(
     most = (M + stride - 1) // stride + LANES
     laid_out, index = np.empty((5, most)), np.empty(most, np.int64)
     shape, room, at = np.empty((5, most), np.float32), np.empty((5, most), np.float32), np.empty(most, np.int32)
-    shown, T, J = (
-        np.empty((C, most), np.float32),
-        np.empty((C, most), np.float32),
-        np.empty((C, 6, most), np.float32),
-    )
+    shown, T = np.empty((C, most), np.float32), np.empty((C, most), np.float32)
+    J = np.empty((C, 6, most), np.float32)
     camera, A, local = np.empty((3, 4)), np.empty((C, 3, 4), np.float32), np.empty(3, np.float32)
     counts = np.empty(C, np.int64)
     moments = np.empty((C, 14))

@@ -19,13 +19,13 @@ from geomocap.scheduling import map_here
 from geomocap.trajectories.trajectory_settings import SmoothingSettings
 
 _REGULAR = 1e-9
-_AT_ONCE = 2048  # paths
+_AT_ONCE = 2048  # paths, so that what is needed on the way takes little memory
 
 
 def smooth_motion(
     positions: np.ndarray, fps: float, sigma: np.ndarray | None = None, settings: SmoothingSettings | None = None
 ) -> PathDerivatives:
-    """Estimate velocities and accelerations wherever there is a position.
+    """Estimate velocities and accelerations wherever there is a position, in single precision.
 
     Parameters
     ----------
