@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geomocap.calibration.silhouette_tangents import OutlineRays, camera_pairs, tangent_misfits
+from geomocap.calibration.silhouette_tangents import OutlineRays, Tangents
 from geomocap.model.camera_correction import CameraCorrection
 from geomocap.model.rig import Rig
 
@@ -39,9 +39,11 @@ def disagreement(given: Rig, outlines: OutlineRays) -> float:
 
     NaN where the outlines tell less than twice what a pose has numbers of any camera.
     """
-    misfits, pairs = _misfits(given, outlines, np.zeros(POSE * len(given))), np.array(camera_pairs(len(given)))
+    rest = _poses(given, np.zeros(POSE * len(given)))
+    tangents = Tangents.of(outlines, *rest)
+    misfits = tangents.misfits(*rest)
     told = np.isfinite(misfits).sum(axis=(1, 2))
-    least = min((told[(pairs == c).any(axis=1)].sum() for c in range(len(given)) if len(pairs)), default=0)
+    least = min(told[tangents.of_camera(c)].sum() for c in range(len(given)))
     return _of_worst_pair(misfits) if least >= 2 * POSE else np.nan
 
 
@@ -82,7 +84,8 @@ def _known(misfits: np.ndarray) -> np.ndarray:
 
 
 def _misfits(given: Rig, outlines: OutlineRays, pose: np.ndarray) -> np.ndarray:
-    return tangent_misfits(outlines, *_poses(given, pose), camera_pairs(len(given)))
+    poses = _poses(given, pose)
+    return Tangents.of(outlines, *poses).misfits(*poses)
 
 
 def _poses(given: Rig, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -100,27 +103,29 @@ def _moved(given: Rig, pose: np.ndarray) -> Rig:
 
 def _adjust(given: Rig, outlines: OutlineRays) -> np.ndarray:
     """Change of the poses (6 C,) that makes the tangents agree: iteratively reweighted least squares, Cauchy's loss."""
-    pairs = camera_pairs(len(given))
     pose = np.zeros(POSE * len(given))
-    noise = _noise(_misfits(given, outlines, pose))
-    scale = _uncertainty(given, outlines, noise)
+    here = _poses(given, pose)
+    tangents = Tangents.of(outlines, *here)
+    noise = _noise(tangents.misfits(*here))
+    scale = _uncertainty(given, outlines, noise, tangents)
     reach = float(noise.max())  # first all is heeded, then what fits
     for _ in range(ROUNDS):
-        misfits = _misfits(given, outlines, pose)
+        misfits = tangents.misfits(*here)
         known = np.isfinite(misfits)
         residual = np.where(known, misfits, 0.0)
         slopes = np.zeros((*misfits.shape, len(pose)))
         for k in range(len(pose)):
-            rows = [i for i, pair in enumerate(pairs) if k // POSE in pair]
-            moved = pose + np.eye(len(pose))[k] * STEP * scale
-            there = tangent_misfits(outlines, *_poses(given, moved), [pairs[i] for i in rows])
-            slopes[rows, :, :, k] = np.where(np.isfinite(there), there - residual[rows], 0.0) / STEP
+            rows = tangents.of_camera(k // POSE)
+            there = tangents.misfits(*_poses(given, pose + np.eye(len(pose))[k] * STEP * scale), rows)
+            slopes[rows, :, :, k] = np.where(known[rows], there - residual[rows], 0.0) / STEP
         reach = max(SOONER * reach, _noise(misfits[None])[0])
         weight = np.where(known, 1.0 / (1.0 + (residual / (CAUCHY * reach)) ** 2), 0.0) / reach**2
         J, r, w = slopes[known], residual[known], weight[known]
         normal = (J * w[:, None]).T @ J + np.eye(len(pose))  # the poses given are observations too
         step = np.linalg.solve(normal, -(J * w[:, None]).T @ r - pose / scale)
         pose = pose + step * scale
+        here = _poses(given, pose)
+        tangents = Tangents.of(outlines, *here)
         if np.abs(step).max() < CONVERGED and reach <= noise.max() * SOONER:
             break
     return pose
@@ -132,11 +137,10 @@ def _noise(misfits: np.ndarray) -> np.ndarray:
     return np.array([max(1.4826 * float(np.median(r)), LEAST_NOISE) if len(r) else 1.0 for r in each])
 
 
-def _uncertainty(given: Rig, outlines: OutlineRays, noise: np.ndarray) -> np.ndarray:
+def _uncertainty(given: Rig, outlines: OutlineRays, noise: np.ndarray, tangents: Tangents) -> np.ndarray:
     """Standard deviations (6 C,) of the poses given, rad and metres: they shift the subject by as many pixels as a
     camera disagrees with the others, half of these more and half less."""
-    pairs = np.array(camera_pairs(len(given)))
-    pixels = np.array([np.median(noise[(pairs == c).any(axis=1)]) for c in range(len(given))])
+    pixels = np.array([np.median(noise[tangents.of_camera(c)]) for c in range(len(given))])
     axes = np.einsum("cfki,cij->cfj", outlines.rays, given.cam_from_world[:, :, :3])
     axes = (axes * outlines.seen[..., None]).sum(axis=1)
     axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-12)

@@ -87,53 +87,93 @@ def _hull(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return hull, ends.any(axis=1)
 
 
-def camera_pairs(count: int) -> list[tuple[int, int]]:
-    """All pairs of so many cameras."""
-    return list(combinations(range(count), 2))
+@dataclass(frozen=True)
+class Tangents:
+    """Where the outermost planes through the centres of pairs of cameras touch the subject.
 
-
-def tangent_misfits(
-    outlines: OutlineRays, rotations: np.ndarray, centers: np.ndarray, pairs: Sequence[tuple[int, int]]
-) -> np.ndarray:
-    """Disagreement of cameras about the outermost planes through their centres.
-
-    Parameters
+    Attributes
     ----------
-    outlines : OutlineRays
-    rotations : (C, 3, 3) float
-        Camera axes from world axes.
-    centers : (C, 3) float, metres
-    pairs : sequence of P pairs of cameras
-
-    Returns
-    -------
-    (P, F, 2) float, pixels
-        Difference of the angles in standard deviations of an outline that is uncertain by one pixel. NaN where a
-        camera sees no silhouette, or its tangent is where the image ends, or the epipole is in the silhouette.
+    pairs : (P, 2) int
+        The cameras.
+    touching : (P, 2, F, 2, 3) float
+        Of each pair and camera: rays of the corners that are touched, in the camera's axes.
+    towards : (P, F, 3) float
+        A direction, in the world, from which the angles round the baseline are counted.
+    known : (P, F, 2) bool
+        Not where a camera sees no silhouette, or its tangent is where the image ends, or the epipole is in the
+        silhouette.
+    focal : (C,) float
+        Focal lengths, pixels.
     """
-    misfits = np.full((len(pairs), outlines.rays.shape[1], 2), np.nan)
-    for row, (a, b) in enumerate(pairs):
-        baseline = centers[b] - centers[a]
-        length = float(np.linalg.norm(baseline))
-        if length == 0:
-            continue
-        baseline = baseline / length
-        rays = [outlines.rays[c] @ rotations[c] for c in (a, b)]
-        towards = rays[0].mean(axis=1) + rays[1].mean(axis=1)
-        x = towards - (towards @ baseline)[:, None] * baseline
-        x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
-        y = np.cross(baseline, x)
-        angles, variances, known = [], [], outlines.seen[a] & outlines.seen[b]
-        ends = np.zeros((outlines.rays.shape[1], 2), bool)
-        for c, ray in zip((a, b), rays, strict=True):
-            angle = np.arctan2(np.einsum("fki,fi->fk", ray, y), np.einsum("fki,fi->fk", ray, x))
-            known = known & (np.ptp(angle, axis=1) < WIDEST)
-            at = np.stack([angle.argmin(axis=1), angle.argmax(axis=1)], axis=1)
-            touching = np.take_along_axis(ray, at[..., None], axis=1)
-            angles.append(np.take_along_axis(angle, at, axis=1))
-            squared = np.maximum(1.0 - (touching @ baseline) ** 2, 1e-12)  # sine of the angle at the baseline
-            variances.append(1.0 / (squared * outlines.focal[c] ** 2))
-            ends |= np.take_along_axis(outlines.cut[c], at, axis=1)
-        misfit = (angles[0] - angles[1]) / np.sqrt(variances[0] + variances[1])
-        misfits[row] = np.where(known[:, None] & ~ends, misfit, np.nan)
-    return misfits
+
+    pairs: np.ndarray
+    touching: np.ndarray
+    towards: np.ndarray
+    known: np.ndarray
+    focal: np.ndarray
+
+    @classmethod
+    def of(cls, outlines: OutlineRays, rotations: np.ndarray, centers: np.ndarray) -> Tangents:
+        """Find them for all pairs of cameras with axes (C, 3, 3), from the world's, and centres (C, 3), metres."""
+        pairs = np.array(list(combinations(range(len(centers)), 2)), int).reshape(-1, 2)
+        shape = len(pairs), outlines.rays.shape[1]
+        touching, towards = np.zeros((shape[0], 2, shape[1], 2, 3)), np.zeros((*shape, 3))
+        known = np.zeros((*shape, 2), bool)
+        world = outlines.rays @ rotations[:, None]
+        for row, (a, b) in enumerate(pairs):
+            baseline = centers[b] - centers[a]
+            length = float(np.linalg.norm(baseline))
+            if length == 0:
+                continue
+            towards[row] = world[a].mean(axis=1) + world[b].mean(axis=1)
+            x, y = _across(baseline / length, towards[row])
+            known[row] = (outlines.seen[a] & outlines.seen[b])[:, None]
+            for side, c in enumerate((a, b)):
+                angle = np.arctan2((world[c] * y[:, None]).sum(axis=2), (world[c] * x[:, None]).sum(axis=2))
+                at = np.stack([angle.argmin(axis=1), angle.argmax(axis=1)], axis=1)
+                touching[row, side] = np.take_along_axis(outlines.rays[c], at[..., None], axis=1)
+                known[row] &= ~np.take_along_axis(outlines.cut[c], at, axis=1)
+                known[row] &= (np.ptp(angle, axis=1) < WIDEST)[:, None]
+        return cls(pairs, touching, towards, known, outlines.focal)
+
+    def of_camera(self, camera: int) -> np.ndarray:
+        """Which pairs a camera has part in, (P,) bool."""
+        result: np.ndarray = (self.pairs == camera).any(axis=1)
+        return result
+
+    def misfits(self, rotations: np.ndarray, centers: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Disagreement of pairs of cameras about the planes through the same corners, if the cameras are elsewhere.
+
+        Right for moves so small that no other corners are touched.
+
+        Parameters
+        ----------
+        rotations : (C, 3, 3) float
+            Camera axes from world axes.
+        centers : (C, 3) float, metres
+        rows : optional
+            Pairs that are asked, all by default.
+
+        Returns
+        -------
+        (P, F, 2) float, pixels
+            Difference of the angles in standard deviations of an outline that is uncertain by one pixel. NaN where
+            not known.
+        """
+        pairs = self.pairs[rows]
+        baseline = centers[pairs[:, 1]] - centers[pairs[:, 0]]
+        baseline = baseline / np.maximum(np.linalg.norm(baseline, axis=1, keepdims=True), 1e-12)
+        x, y = _across(baseline[:, None], self.towards[rows])
+        rays = self.touching[rows] @ rotations[pairs][:, :, None]
+        angle = np.arctan2((rays * y[:, None, :, None]).sum(axis=-1), (rays * x[:, None, :, None]).sum(axis=-1))
+        # squared sine of the angle at the baseline
+        squared = np.maximum(1.0 - (rays * baseline[:, None, None, None]).sum(axis=-1) ** 2, 1e-12)
+        variance = (1.0 / (squared * self.focal[pairs][:, :, None, None] ** 2)).sum(axis=1)
+        return np.where(self.known[rows], (angle[:, 0] - angle[:, 1]) / np.sqrt(variance), np.nan)
+
+
+def _across(baseline: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors across baselines (…, 3), one as near as can be to directions (…, 3), the other across that too."""
+    x = towards - (towards * baseline).sum(axis=-1, keepdims=True) * baseline
+    x /= np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-12)
+    return x, np.cross(baseline, x)

@@ -20,6 +20,7 @@ _NEW_TEMPLATE_FACING = 0.5  # cosine from which a camera's first template of a p
 _NEW_TEMPLATE_CORRELATION = 0.9  # correlation from which, and below which an updated one is taken again
 _SURE = 0.9  # correlation from which no second start is tried
 _SURE_START = 0.95  # correlation of the blurred images from which optical flow isn't needed
+_BETTER = 1e-2  # sum of the cameras' correlations that makes another start better
 _NEIGHBOURS = 8  # whose motion is tried, and compared
 _ALONE = 2.0  # times the standard deviation that is allowed where a single camera sees a patch
 _ROUGH = 2 / 3  # part of a difference along a lone camera's ray that doesn't count
@@ -125,7 +126,9 @@ def search(state: Followed, previous: FrameViews, view: FrameViews, settings: Tr
     wanted = np.flatnonzero((state.gap <= _PATIENCE) | (state.gap % _SELDOM == 0))
     onward = extrapolate(patches.positions, patches.frames, state.velocity, state.spin)
     start, fit = _best_start(patches, wanted, [onward], view, settings)
-    unsure = wanted[fit[wanted] < _SURE_START]
+    seen = fit[wanted] > -1
+    mean = np.where(seen, fit[wanted], 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+    unsure = wanted[mean < _SURE_START]
     if len(unsure):
         some = patches.positions[unsure]
         seen = _asked(patches, unsure, patches.positions, patches.frames, previous, settings)[unsure]
@@ -238,17 +241,17 @@ def _best_start(
     settings: TrackingSettings,
     fit: np.ndarray | None = None,
 ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Compare starts on the coarse level; return the best for each patch, and its correlation.
+    """Compare starts on the coarse level; return the best for each patch, and how its cameras like it, (N, C) float.
 
-    `fit` is that of the first start, (N,), where it is known.
+    Each camera's correlation counts, and that it sees the patch there. `fit` is that of the first start, where known.
     """
-    best = np.full(len(patches), -3.0) if fit is None else fit.copy()
+    best = np.full(patches.has.shape, -1.0) if fit is None else fit.copy()
     X, Q = starts[0][0].copy(), starts[0][1].copy()
     for positions, frames in starts if fit is None else starts[1:]:
         use = _asked(patches, which, positions, frames, view, settings)
         tried = align(patches, which, positions, frames, use, view, iterations=(0, -1), least_correlation=-1.0)
-        better = tried.correlation > best + 1e-3
-        best[better] = tried.correlation[better]
+        better = tried.by_camera.sum(axis=1) > best.sum(axis=1) + _BETTER
+        best[better] = tried.by_camera[better]
         X[better], Q[better] = positions[better], frames[better]
     return (X, Q), best
 

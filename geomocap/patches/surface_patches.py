@@ -364,7 +364,8 @@ def align(
         )
     score, n_views, sigma = np.full(N, -1.0), np.zeros(N, int), np.full(N, np.inf)
     asked = correlation[which]
-    counted, part = asked >= least_correlation, asked > -1
+    part = asked > -1
+    counted = part & (asked >= least_correlation)
     mean = np.where(part, asked, 0).sum(axis=1) / np.maximum(part.sum(axis=1), 1)
     best = np.where(counted, asked, 0).sum(axis=1) / np.maximum(counted.sum(axis=1), 1)
     score[which] = np.where(part.any(axis=1), np.where(counted.any(axis=1), best, mean), -1.0)

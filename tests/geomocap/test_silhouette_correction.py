@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from geomocap.calibration.silhouette_correction import correct_cameras, disagreement
-from geomocap.calibration.silhouette_tangents import OutlineRays, camera_pairs, tangent_misfits
+from geomocap.calibration.silhouette_tangents import OutlineRays, Tangents
 from geomocap.config import Config
 from geomocap.errors import CaptureError, RunError
 from geomocap.files.capture import Capture, CaptureInfo, write_capture_info
@@ -64,17 +64,34 @@ def masks(rig) -> list[list[np.ndarray]]:
     return [silhouettes(ring(4, focal=FOCAL), figure(k)) for k in range(FRAMES)]
 
 
+def misfits_of(rig: Rig, outlines: OutlineRays) -> tuple[np.ndarray, Tangents]:
+    poses = rig.cam_from_world[:, :, :3], rig.centers
+    tangents = Tangents.of(outlines, *poses)
+    return tangents.misfits(*poses), tangents
+
+
 def test_tangents_of_true_cameras_agree_to_a_pixel(rig, masks):
     outlines = OutlineRays.of(rig, masks)
-    args = outlines, rig.cam_from_world[:, :, :3], rig.centers, camera_pairs(4)
-    misfits = tangent_misfits(*args)
+    misfits, tangents = misfits_of(rig, outlines)
     assert np.isfinite(misfits).mean() > 0.8
     assert np.nanmedian(np.abs(misfits)) < 1.0
     wrong = turned(rig, 1, 2.0)
-    worse = tangent_misfits(outlines, wrong.cam_from_world[:, :, :3], wrong.centers, camera_pairs(4))
-    touched = [1 in pair for pair in camera_pairs(4)]
+    worse, _ = misfits_of(wrong, outlines)
+    touched = tangents.of_camera(1)
     assert np.nanmedian(np.abs(worse[touched])) > 3 * np.nanmedian(np.abs(misfits[touched]))
-    np.testing.assert_array_equal(worse[~np.array(touched)], misfits[~np.array(touched)])
+    np.testing.assert_array_equal(worse[~touched], misfits[~touched])
+
+
+def test_misfits_at_the_same_corners_are_right_until_another_one_is_touched(rig, masks):
+    outlines = OutlineRays.of(rig, masks)
+    before, tangents = misfits_of(rig, outlines)
+    wrong = turned(rig, 1, 0.2)
+    after, moved = misfits_of(wrong, outlines)
+    quick = tangents.misfits(wrong.cam_from_world[:, :, :3], wrong.centers)
+    same = (tangents.touching == moved.touching).all(axis=(1, 4)) & np.isfinite(after)
+    assert same.mean() > 0.8
+    assert np.nanmax(np.abs(after - before)) > 0.01
+    np.testing.assert_allclose(quick[same], after[same], atol=1e-9)
 
 
 def test_a_silhouette_cut_off_or_missing_says_nothing(rig, masks):
@@ -85,10 +102,9 @@ def test_a_silhouette_cut_off_or_missing_says_nothing(rig, masks):
         frame[1][rows[0] : HEIGHT, :][:, : WIDTH // 2] = 255  # reaches the border at the left and below
     outlines = OutlineRays.of(rig, cut)
     assert not outlines.seen[0].any() and outlines.cut[1].any()
-    misfits = tangent_misfits(outlines, rig.cam_from_world[:, :, :3], rig.centers, camera_pairs(4))
-    for row, pair in enumerate(camera_pairs(4)):
-        if 0 in pair:
-            assert np.isnan(misfits[row]).all()
+    misfits, tangents = misfits_of(rig, outlines)
+    assert np.isnan(misfits[tangents.of_camera(0)]).all()
+    assert np.isfinite(misfits).any()
 
 
 def test_a_camera_that_was_touched_is_put_right(rig, masks):
