@@ -119,10 +119,10 @@ def search(state: Followed, previous: FrameViews, view: FrameViews, settings: Tr
     """Align patches from the best of several starts; those that fail once more from their neighbours' motions.
 
     Where moving on as before fits the blurred images, it is the start; elsewhere optical flow in all cameras is lifted
-    into space and compared with it. Patches lost for long are looked for in every fourth frame only.
+    into space and compared with it. Those that had been lost before are where their companions have put them: they
+    don't try again, and long after they are looked for in every fourth frame only.
     """
     patches = state.patches
-    N = len(patches)
     wanted = np.flatnonzero((state.gap <= _PATIENCE) | (state.gap % _SELDOM == 0))
     onward = extrapolate(patches.positions, patches.frames, state.velocity, state.spin)
     start, fit = _best_start(patches, wanted, [onward], view, settings)
@@ -136,31 +136,22 @@ def search(state: Followed, previous: FrameViews, view: FrameViews, settings: Tr
         lifted[unsure] = some + lift_flow(previous, some, image_flow(previous, view, some, seen))
         start, _ = _best_start(patches, unsure, [start, (lifted, onward[1])], view, settings, fit)
     found = _align(state, wanted, start, view, settings)
-    # those that are doubtful try again with the motion of one of their neighbours
-    new = np.ones(N, bool)
-    for _ in range(2):
-        certain = (found.correlation > _SURE) & (found.n_views >= _enough(state, found, settings))
-        sure = np.flatnonzero(certain)
-        doubtful = wanted[~certain[wanted]]
-        near = nearest(patches.positions, doubtful, sure, _NEIGHBOURS)
-        if near.shape[1]:
-            helped = new[near].any(axis=1)
-            doubtful, near = doubtful[helped], near[helped]
-        if not near.size:
-            break
-        places, turned = carried(patches.positions, patches.frames, near, found.positions, found.frames, doubtful)
-        starts = []
-        for j in range(0, near.shape[1], 2):
-            X, Q = found.positions.copy(), found.frames.copy()
-            X[doubtful], Q[doubtful] = places[:, j], turned[:, j]
-            starts.append((X, Q))
-        again = _align(state, doubtful, _best_start(patches, doubtful, starts, view, settings)[0], view, settings)
-        better = np.zeros(N, bool)
-        better[doubtful] = (again.correlation > found.correlation + 1e-3)[doubtful]
-        better &= again.n_views >= np.minimum(found.n_views, settings.n_views)
-        found = found.replaced(better, again)
-        new = better & ~certain
-    return found
+    # those that are doubtful now try again with the motions of their neighbours
+    certain = (found.correlation > _SURE) & (found.n_views >= _enough(state, found, settings))
+    sure, doubtful = np.flatnonzero(certain), np.flatnonzero(~certain & (state.gap == 0))
+    near = nearest(patches.positions, doubtful, sure, _NEIGHBOURS)
+    if not near.size:
+        return found
+    places, turned = carried(patches.positions, patches.frames, near, found.positions, found.frames, doubtful)
+    starts = []
+    for j in range(0, near.shape[1], 2):
+        X, Q = found.positions.copy(), found.frames.copy()
+        X[doubtful], Q[doubtful] = places[:, j], turned[:, j]
+        starts.append((X, Q))
+    again = _align(state, doubtful, _best_start(patches, doubtful, starts, view, settings)[0], view, settings)
+    better = ~certain & (again.correlation > found.correlation + 1e-3)
+    better &= again.n_views >= np.minimum(found.n_views, settings.n_views)
+    return found.replaced(better, again)
 
 
 def judge(state: Followed, found: PatchAlignment, view: FrameViews, settings: TrackingSettings) -> np.ndarray:
