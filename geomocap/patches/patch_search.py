@@ -20,7 +20,7 @@ _NEW_TEMPLATE_FACING = 0.5  # cosine from which a camera's first template of a p
 _NEW_TEMPLATE_CORRELATION = 0.9  # correlation from which, and below which an updated one is taken again
 _SURE = 0.9  # correlation from which no second start is tried
 _SURE_START = 0.95  # correlation of the blurred images from which optical flow isn't needed
-_BETTER = 1e-2  # sum of the cameras' correlations that makes another start better
+_BETTER = 1e-2  # by which a start must be better, sum of correlations; no other value was tried
 _NEIGHBOURS = 8  # whose motion is tried, and compared
 _ALONE = 2.0  # times the standard deviation that is allowed where a single camera sees a patch
 _ROUGH = 2 / 3  # part of a difference along a lone camera's ray that doesn't count
@@ -126,8 +126,8 @@ def search(state: Followed, previous: FrameViews, view: FrameViews, settings: Tr
     wanted = np.flatnonzero((state.gap <= _PATIENCE) | (state.gap % _SELDOM == 0))
     onward = extrapolate(patches.positions, patches.frames, state.velocity, state.spin)
     start, fit = _best_start(patches, wanted, [onward], view, settings)
-    seen = fit[wanted] > -1
-    mean = np.where(seen, fit[wanted], 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+    asked = fit[wanted] > -1
+    mean = np.where(asked, fit[wanted], 0.0).sum(axis=1) / np.maximum(asked.sum(axis=1), 1)
     unsure = wanted[mean < _SURE_START]
     if len(unsure):
         some = patches.positions[unsure]
@@ -232,7 +232,7 @@ def _best_start(
     settings: TrackingSettings,
     fit: np.ndarray | None = None,
 ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Compare starts on the coarse level; return the best for each patch, and how its cameras like it, (N, C) float.
+    """Compare starts on the coarse level; return the best for each patch, and its correlations, (N, C) float.
 
     Each camera's correlation counts, and that it sees the patch there. `fit` is that of the first start, where known.
     """
