@@ -10,6 +10,7 @@ middle. Whether it runs, fails or is ended changes no result.
 from __future__ import annotations
 
 import gc
+import hashlib
 import importlib
 import json
 import os
@@ -61,7 +62,10 @@ def _begin() -> subprocess.Popen[bytes] | None:
 
 
 def _note() -> Path | None:
-    """Empty file that says that all is compiled for this machine; None where nothing can be kept."""
+    """Empty file that says that all is compiled for this machine; None where nothing can be kept.
+
+    Each copy of the package has its own, as Numba keeps the kernels of each place apart.
+    """
     folder = os.environ.get("NUMBA_CACHE_DIR")
     if not folder or os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
         return None
@@ -70,7 +74,8 @@ def _note() -> Path | None:
     from llvmlite import binding
 
     machine = f"{platform.python_version()}-numba{version('numba')}-{binding.get_host_cpu_name()}"
-    return Path(folder) / f"ahead-{machine}"
+    place = hashlib.sha256(str(LIST.parent).encode()).hexdigest()[:12]
+    return Path(folder) / f"ahead-{machine}-{place}"
 
 
 def listed() -> list[tuple[str, str, list[Any]]]:

@@ -154,3 +154,9 @@ def test_what_was_compiled_is_noted(empty_cache, monkeypatch):
     monkeypatch.setattr(kernels_ahead, "_end_with_parent", lambda: None)
     kernels_ahead.main()
     assert kernels_ahead._note().exists()
+
+
+def test_another_copy_of_the_package_is_noted_apart(empty_cache, monkeypatch, tmp_path):
+    here = kernels_ahead._note()
+    monkeypatch.setattr(kernels_ahead, "LIST", tmp_path / kernels_ahead.LIST.name)
+    assert here is not None and kernels_ahead._note() not in (None, here)
