@@ -74,7 +74,7 @@ def _note() -> Path | None:
     from llvmlite import binding
 
     machine = f"{platform.python_version()}-numba{version('numba')}-{binding.get_host_cpu_name()}"
-    place = hashlib.sha256(str(LIST.parent).encode()).hexdigest()[:12]
+    place = hashlib.sha256(os.fsencode(LIST.parent)).hexdigest()[:12]
     return Path(folder) / f"ahead-{machine}-{place}"
 
 
