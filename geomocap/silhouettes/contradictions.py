@@ -328,7 +328,7 @@ def _lags(
 
     def attempt(lag: int) -> None:
         rows = [n for n, f in enumerate(evidence.frames) if 0 <= f + lag < count]
-        if lag in tried or lag == 0 or len(rows) < max(2, len(evidence.frames) / 2):
+        if lag in tried or lag == 0 or len(rows) < max(2, len(evidence.frames) / 2) or not mean(before[rows]):
             return
         part = evidence.part(rows)
         changed = part.replaced(camera, moments(camera, [f + lag for f in part.frames]))
