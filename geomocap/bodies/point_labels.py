@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import csr_matrix
-from scipy.spatial import cKDTree
 
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.point_grid import PointGrid
 from geomocap.model.surface import plane_normals
 
 _VOTERS = 12
@@ -43,14 +43,14 @@ def label_points(bodies: MotionBodies, paths: MotionPaths, frame: int, points: n
         return np.full(len(points), -1, np.int32)
     samples = bodies.positions[:, frame]
     trust = np.where(paths.seen[:, frame], 1.0, 0.3)
-    spacing = float(np.median(cKDTree(bodies.rest).query(bodies.rest, 2)[0][:, 1]))
-    shapes = [cKDTree(bodies.rest[bodies.label == b]) for b in range(bodies.body_count)]
+    spacing = float(np.median(PointGrid.of(bodies.rest).query(bodies.rest, 2)[0][:, 1]))
+    shapes = [PointGrid.of(bodies.rest[bodies.label == b]) for b in range(bodies.body_count)]
     # of either side
     planes = [shape.query(shape.data, min(_PLANE, shape.n))[1].reshape(shape.n, -1) for shape in shapes]
     normals = [plane_normals(shape.data, near) for shape, near in zip(shapes, planes, strict=True)]
-    tree = cKDTree(samples)
+    grid = PointGrid.of(samples)
     parts = [
-        _label_some(bodies, frame, points[i : i + _CHUNK], tree, trust, shapes, normals, spacing)
+        _label_some(bodies, frame, points[i : i + _CHUNK], grid, trust, shapes, normals, spacing)
         for i in range(0, len(points), _CHUNK)
     ]
     return np.concatenate(parts)
@@ -60,18 +60,18 @@ def _label_some(
     bodies: MotionBodies,
     frame: int,
     points: np.ndarray,
-    tree: cKDTree,
+    grid: PointGrid,
     trust: np.ndarray,
-    shapes: list[cKDTree],
+    shapes: list[PointGrid],
     normals: list[np.ndarray],
     spacing: float,
 ) -> np.ndarray:
-    voters = min(_VOTERS, tree.n)
-    distances, nearest = tree.query(points, voters)
+    voters = min(_VOTERS, grid.n)
+    distances, nearest = grid.query(points, voters)
     distances, nearest = distances.reshape(len(points), voters), nearest.reshape(len(points), voters)
     votes = trust[nearest] / (distances**2 + (0.5 * spacing) ** 2)
     rows = np.arange(0, votes.size + 1, voters)
-    score = csr_matrix((votes.ravel(), nearest.ravel(), rows), (len(points), tree.n)) @ bodies.weights
+    score = csr_matrix((votes.ravel(), nearest.ravel(), rows), (len(points), grid.n)) @ bodies.weights
     score /= score.sum(axis=1, keepdims=True)
     score[score <= _LEAST_VOTES] = 0.0
     doubtful = (score > 0).sum(axis=1) > 1

@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 from numba import njit
-from scipy.spatial import cKDTree
 
+from geomocap.model.point_grid import PointGrid
 from geomocap.nodes.surface_points import PointSet
 
 
@@ -69,15 +69,15 @@ class Target:
         np.multiply(scale / self.feature_scale, features, out=found[:, 6:])
         return found
 
-    def tree(self, scale: float) -> cKDTree:
-        """Tree of the coordinates at a scale, which is kept."""
-        tree = self._trees.get(scale)
-        if tree is None:
-            tree = self._trees[scale] = cKDTree(self.coordinates(scale))
-        return tree
+    def grid(self, scale: float) -> PointGrid:
+        """Grid of the coordinates at a scale, which is kept."""
+        grid = self._grids.get(scale)
+        if grid is None:
+            grid = self._grids[scale] = PointGrid.of(self.coordinates(scale))
+        return grid
 
     @cached_property
-    def _trees(self) -> dict[float, cKDTree]:
+    def _grids(self) -> dict[float, PointGrid]:
         return {}
 
 
@@ -104,10 +104,10 @@ def pull(
     feature_weight : float
         Weight of the features' differences, one feature scale for one `scale` of distance.
     """
-    points, tree = target.points, target.tree(scale)
+    points, grid = target.points, target.grid(scale)
     own = target.search_coordinates(y, normals, features, scale)
-    far_out, found = tree.query(own)
-    back, taker = cKDTree(own).query(tree.data)
+    far_out, found = grid.query(own)
+    back, taker = PointGrid.of(own).query(grid.data)
     forth_weight = np.exp(-0.5 * (far_out / scale) ** 2)
     back_weight = np.exp(-0.5 * (back / scale) ** 2)
     fraction = min(len(y) / len(points), 1.0)

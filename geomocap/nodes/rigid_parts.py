@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.sparse import csr_matrix, diags, identity
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from geomocap.model.point_grid import PointGrid
 from geomocap.nodes.correspondences import Target, pull
 from geomocap.nodes.node_graph import NodeGraph
 from geomocap.nodes.node_settings import NodeTrackingSettings
@@ -50,7 +50,7 @@ class PartTracker:
         """Take the frames' points, their normals turned outwards; `closest` is the least scale, metres."""
         self.graph, self.targets, self.closest, self.settings = graph, targets, closest, settings
         c = max(_MISFIT_SCALE * graph.spacing, closest)
-        self.trees = [cKDTree(np.hstack([p.points.positions, c * p.points.normals])) for p in targets]
+        self.grids = [PointGrid.of(np.hstack([p.points.positions, c * p.points.normals])) for p in targets]
         self.owner = graph.binding[np.arange(len(graph.samples)), graph.weights.argmax(axis=1)]
         N = len(graph.nodes)
         i, j = graph.edges.T
@@ -165,7 +165,7 @@ class PartTracker:
         g, target = self.graph, self.targets[frame]
         c = max(_FORM_SCALE * g.spacing, self.closest)
         y, normals = g.deform(x, R)
-        distance, found = cKDTree(target.coordinates(c)).query(target.search_coordinates(y, normals, g.features, c))
+        distance, found = target.grid(c).query(target.search_coordinates(y, normals, g.features, c))
         w = np.exp(-0.5 * (distance / c) ** 2)
         n = target.points.normals[found]
         off = ((y - target.points.positions[found]) * n).sum(axis=1)
@@ -209,7 +209,7 @@ class PartTracker:
         c = max(_MISFIT_SCALE * g.spacing, self.closest)
         y = (R[part] @ g.samples[sample][..., None])[..., 0] + t[part]
         n = (R[part] @ g.normals[sample][..., None])[..., 0]
-        found = self.trees[frame].query(np.hstack([y, c * n]), distance_upper_bound=3 * c)[1]
+        found = self.grids[frame].query(np.hstack([y, c * n]), reach=3 * c)[1]
         none = found == len(points)
         found[none] = 0
         off, facing = y - points.positions[found], points.normals[found]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import open3d as o3d
+from scipy.spatial import cKDTree
 
+from geomocap.model.point_grid import PointGrid
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.nodes.node_tracking import track_nodes
 from geomocap.nodes.surface_points import point_set
@@ -23,8 +25,24 @@ def normals_with_open3d(points: np.ndarray) -> np.ndarray:
     return np.asarray(cloud.normals)
 
 
+def nearest_points() -> Row:
+    """Time points of a bent figure, with normals and colours, found from another frame's, beside SciPy's tree."""
+    now, then = (point_set(star_points(t / FRAMES, POINTS, seed=t), POINTS, 9) for t in (0, 1))
+    colours = np.random.default_rng(0).random((2, POINTS, 3))
+    data, asked = (
+        np.hstack([p.positions, 0.05 * p.normals, 0.05 * c[: len(p)]])
+        for p, c in zip((now, then), colours, strict=True)
+    )
+    return Row(
+        f"nearest of {len(now):,} points with normals and colours for as many, grid made anew",
+        measure(lambda: PointGrid.of(data).query(asked), 20),
+        "SciPy cKDTree",
+        measure(lambda: cKDTree(data).query(asked), 20),
+    )
+
+
 def benchmark() -> list[Row]:
-    """Time the normals beside Open3D's, and the whole tracking."""
+    """Time nearest points, the normals beside Open3D's, and the whole tracking."""
     frames = [star_points(t / FRAMES, POINTS, seed=t) for t in range(FRAMES)]
     settings = NodeTrackingSettings()
     tracks = track_nodes(lambda t: frames[t], FRAMES, settings)
@@ -33,6 +51,7 @@ def benchmark() -> list[Row]:
     normals = measure(lambda: point_set(frames[0], POINTS, 9), 5)
     tracking = measure(lambda: track_nodes(lambda t: frames[t], FRAMES, settings), 2, warm_up=False)
     return [
+        nearest_points(),
         Row(
             f"normals turned outwards, {POINTS:,} points",
             normals,
