@@ -14,6 +14,7 @@ Examples
 
 import importlib
 import os
+import sys
 from typing import TYPE_CHECKING, Any
 
 # Threads without work sleep instead of spinning: on a machine that does other things too, spinning makes short kernels
@@ -21,7 +22,12 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 # Frames and parts of kernels are mapped over threads already; matrices here are long and thin, and multiplying them in
 # two threads takes up to twenty times as long as in one. Sums have one order, too, however many cores there are.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+if "OPENBLAS_NUM_THREADS" not in os.environ:
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    if "numpy" in sys.modules:  # it has read the environment already
+        from threadpoolctl import threadpool_limits
+
+        threadpool_limits(1, user_api="blas")
 
 from geomocap.kernel_cache import configure_numba
 from geomocap.version import __version__

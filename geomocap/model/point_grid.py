@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-_CELLS_PER_POINT = 4  # a surface meets few of them: one to three points are in those that it does
+# A surface meets few of the cells: one to four points are in those that it does. 4 instead of 2 make single points in
+# nine dimensions 5 % faster, and the twelve nearest ones in space 12 % slower.
+_CELLS_PER_POINT = 2
 
 
 @dataclass(frozen=True)

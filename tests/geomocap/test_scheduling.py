@@ -97,9 +97,12 @@ def test_a_limit_holds_for_executors_and_kernels_made_afterwards():
     assert numba.get_num_threads() == numba.config.NUMBA_NUM_THREADS
 
 
-@pytest.mark.parametrize(("chosen", "used"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
-def test_matrices_are_multiplied_in_one_thread_unless_the_user_says_otherwise(chosen, used):
-    inherited = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
-    words = "import os, geomocap; print(os.environ['OPENBLAS_NUM_THREADS'])"
+@pytest.mark.parametrize("first", ["geomocap", "numpy"])
+@pytest.mark.parametrize(("chosen", "used"), [({}, 1), ({"OPENBLAS_NUM_THREADS": "2"}, min(2, os.cpu_count() or 1))])
+def test_matrices_are_multiplied_in_one_thread_unless_the_user_says_otherwise(first, chosen, used):
+    inherited = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    words = (
+        f"import {first}, geomocap, numpy, threadpoolctl as t; print({{i['num_threads'] for i in t.threadpool_info()}})"
+    )
     told = subprocess.check_output([sys.executable, "-c", words], env=inherited | chosen, text=True)
-    assert told.strip() == used
+    assert told.strip() == f"{{{used}}}"
