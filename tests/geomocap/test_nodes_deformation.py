@@ -149,9 +149,9 @@ def test_turns_of_a_step_are_rotation_vectors_no_longer_than_the_most():
     np.testing.assert_allclose(turned, Rotation.from_rotvec(turns / much).as_matrix() @ R, atol=1e-14)
 
 
-def test_trees_of_a_frame_are_kept():
+def test_grids_of_a_frame_are_kept():
     target = Target(small_graph()[0], np.zeros(0))
-    assert target.tree(0.1) is target.tree(0.1)
+    assert target.grid(0.1) is target.grid(0.1)
     np.testing.assert_array_equal(target.tree(0.2).data, target.coordinates(0.2))
 
 
