@@ -152,7 +152,7 @@ def test_turns_of_a_step_are_rotation_vectors_no_longer_than_the_most():
 def test_grids_of_a_frame_are_kept():
     target = Target(small_graph()[0], np.zeros(0))
     assert target.grid(0.1) is target.grid(0.1)
-    np.testing.assert_array_equal(target.tree(0.2).data, target.coordinates(0.2))
+    np.testing.assert_array_equal(target.grid(0.2).data, target.coordinates(0.2))
 
 
 def test_pull_vanishes_where_the_surface_fits():
