@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-# A surface meets few of the cells: one to four points are in those that it does. With 4 a galloping stag's nearest points
-# take a tenth longer, making the grid included; with 1 the twelve nearest ones in space do, single ones don't.
+# A surface meets few of the cells: one to four points are in those that it does. With 4 the nearest points of a
+# galloping stag take a tenth longer, making the grid included; with 1 the twelve nearest ones in space do.
 _CELLS_PER_POINT = 2
 
 
