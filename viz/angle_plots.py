@@ -56,7 +56,7 @@ def angle_blocks(results: Results, desk: Desk) -> list[Block]:
     """Return what a report says of names and joint angles."""
     found = angles_of(results)
     if found is None or not found[0].names:
-        desk.step()
+        desk.steps.step()
         return [] if found is None else [text(found[1])]
     words = (
         "As in angles.csv: flexion, adduction and rotation of named joints, zero where limbs are straight; the turn "

@@ -192,7 +192,8 @@ def on_paper(image: np.ndarray) -> np.ndarray:
     if image.shape[2] == 3:
         return image
     opacity = image[..., 3:].astype(np.uint16)
-    return ((image[..., :3] * opacity + 255 * (255 - opacity) + 127) // 255).astype(np.uint8)
+    mixed = image[..., :3] * opacity + 255 * (255 - opacity) + 128
+    return ((mixed + (mixed >> 8)) >> 8).astype(np.uint8)  # exactly divided by 255 and rounded
 
 
 def write_png(path: Path, image: np.ndarray) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping, Sequence
+from threading import Lock
 from typing import Any, ParamSpec
 
 import matplotlib
@@ -42,13 +43,14 @@ STYLE: dict[Any, Any] = {
 MUTED = "#9aa1aa"
 WIDTH = 9.6
 """Width of every plot, inches."""
+_ONE_AT_A_TIME = Lock()  # Matplotlib's styles and fonts are those of the process
 
 
 def plot(draw: Callable[P, Figure]) -> Callable[P, bytes]:
     """Give a function that draws a figure the project's style, and turn the figure into a PNG."""
 
     def styled(*args: P.args, **kwargs: P.kwargs) -> bytes:
-        with matplotlib.rc_context(STYLE):
+        with _ONE_AT_A_TIME, matplotlib.rc_context(STYLE):
             figure = draw(*args, **kwargs)
             buffer = io.BytesIO()
             FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
@@ -61,7 +63,7 @@ def plot(draw: Callable[P, Figure]) -> Callable[P, bytes]:
 
 def figure_of(width: float, height: float) -> Figure:
     """Return an empty figure, sizes in inches."""
-    return Figure(figsize=(width, height), dpi=100 * DENSITY, layout="constrained")
+    return Figure(figsize=(width, height), dpi=100 * DENSITY, layout="tight")  # half the time of "constrained"
 
 
 def times_axis(count: int, fps: float | None) -> tuple[np.ndarray, str]:

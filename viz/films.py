@@ -20,13 +20,12 @@ from geomocap.files.whole_files import is_whole_mp4
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items, threads
 from viz import scene
+from viz.desk import REPORTED
 from viz.drawing import GAP, fit, on_paper, write_on
 from viz.rendering import Look, Model
 from viz.run_contents import Results
 from viz.sheets import overlay, picture, tile_size
 from viz.viewpoints import ViewStage
-
-_REPORTED = 0.25  # seconds between two reports while a film is waited for
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, quality: int = 23) -> None:
@@ -169,7 +168,7 @@ def filmed_beside(
         def finished() -> Path:
             done = False
             while not done:  # progress is reported by the thread that began the work
-                done = bool(wait([film], _REPORTED).done)
+                done = bool(wait([film], REPORTED).done)
                 for last in tuple(reached):
                     progress(*last)
             film.result()

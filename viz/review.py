@@ -101,34 +101,37 @@ def review(
         stage = find_stage(results)
     except GeometryError:
         stage = None
-    desk = Desk(run.path / "review", progress, 29)
-    progress("review", 0, desk.total)
-    quality = assess(results, chosen)
-    desk.step()
-    turns = None if stage is None else turntable(results, stage)
-    desk.step()
+    desk = Desk.of(run.path / "review", progress, 29)
+    desk.report()
     look = Look(samples=1 if quick else 2)
     with filmed_beside(results, stage, desk.folder / "motion.mp4", progress, look) as film:
-        parts = [
-            section("What went in", _inputs(results, stage, chosen, desk)),
-            section("Silhouettes", _silhouettes(results, quality, chosen, desk)),
-            section("Volume and points", _volume(results, stage, chosen, desk)),
-            section("Surface measurement", _clouds(results, measured, chosen, desk)),
-            section("Surface points through time", _tracks(results, stage, chosen, desk)),
-            section("Ellipsoids and their paths", _ellipsoids(results, stage, chosen, desk)),
-            section("Rigid bodies", _bodies(results, stage, chosen, desk)),
-            section("How the bodies were told apart", _separation(results, stage, desk)),
-            section("Skeleton and motion", _skeleton(results, stage, quality, chosen, desk)),
-            section("Key-points", _keypoints(results, stage, chosen, desk)),
-            section("Quality", figures_of_quality(results, quality)),
-            section("Time", _times(results, desk)),
-            section("Settings and versions", record_blocks(results)),
+        quality = assess(results, chosen)
+        desk.steps.step()
+        desk.report()
+        turns = None if stage is None else turntable(results, stage)
+        desk.steps.step()
+        named_parts: list[tuple[str, Callable[[Desk], list[Block]]]] = [
+            ("What went in", lambda desk: _inputs(results, stage, chosen, desk)),
+            ("Silhouettes", lambda desk: _silhouettes(results, quality, chosen, desk)),
+            ("Volume and points", lambda desk: _volume(results, stage, chosen, desk)),
+            ("Surface measurement", lambda desk: _clouds(results, measured, chosen, desk)),
+            ("Surface points through time", lambda desk: _tracks(results, stage, chosen, desk)),
+            ("Ellipsoids and their paths", lambda desk: _ellipsoids(results, stage, chosen, desk)),
+            ("Rigid bodies", lambda desk: _bodies(results, stage, chosen, desk)),
+            ("How the bodies were told apart", lambda desk: _separation(results, stage, desk)),
+            ("Skeleton and motion", lambda desk: _skeleton(results, stage, quality, chosen, desk)),
+            ("Key-points", lambda desk: _keypoints(results, stage, chosen, desk)),
+            ("Quality", lambda _: figures_of_quality(results, quality)),
+            ("Time", lambda desk: _times(results, desk)),
+            ("Settings and versions", lambda _: record_blocks(results)),
         ]
+        blocks = desk.side_by_side([make for _, make in named_parts])
+        parts = [section(title, found) for (title, _), found in zip(named_parts, blocks, strict=True)]
         head = [*preview_note(results), *changed_files(results), *verdict(results), *summary(quality)]
         parts.insert(0, section("Result", [*head, *_result(results, stage, chosen, turns, desk, film)]))
     page = desk.folder / "report.html"
     write_report(page, Report(title(results), lead(results), key_figures(results), tuple(parts), turns))
-    progress("review", desk.total, desk.total)
+    progress("review", desk.steps.total, desk.steps.total)
     return [*desk.written, page]
 
 
@@ -157,13 +160,13 @@ def _result(
         words = "Look for limbs that keep their colour, joints that stay inside the volume, and bones that don't jump."
         told = f"From a slowly turning free view{over}. {words}"
         blocks.append(video(path, "The motion", told, folded=turns is not None))
-    desk.step()
+    desk.steps.step()
     return blocks + stages
 
 
 def _inputs(results: Results, stage: ViewStage | None, frames: list[int], desk: Desk) -> list[Block]:
     if results.capture is None:
-        desk.step()
+        desk.steps.step()
         return [missing("No capture is at hand (the geometry came from elsewhere), so there are no cameras or images.")]
     blocks: list[Block] = [*camera_remarks(results), cameras_table(results)]
     if stage is not None:
@@ -176,7 +179,7 @@ def _inputs(results: Results, stage: ViewStage | None, frames: list[int], desk: 
 def _silhouettes(results: Results, quality: Quality, frames: list[int], desk: Desk) -> list[Block]:
     image = sheets.silhouette_sheet(results, frames)
     if image is None or quality.coverage is None:
-        desk.step()
+        desk.steps.step()
         return [missing("The run has no silhouettes.")]
     words = (
         "The line should follow the subject's outline, with nothing of it left out: what one camera misses is cut out "
@@ -223,7 +226,7 @@ def _clouds(
     number = frames[len(frames) // 2]
     found = measured(number)
     if found is None:
-        desk.step()
+        desk.steps.step()
         return blocks
     frame, image = found
     words = (
