@@ -13,6 +13,7 @@ Three questions, each asked of what the others did not use for their answer:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -30,7 +31,7 @@ from geomocap.model.even_choice import evenly_chosen
 from geomocap.model.ray_casting import TriangleScene
 from geomocap.model.rig import Rig
 from geomocap.model.self_check import SelfCheck
-from geomocap.model.skeleton import Skeleton
+from geomocap.scheduling import map_here
 from geomocap.skeleton.kinematics import BodyMotion
 from geomocap.subject.model_mesh import ModelMesh, model_mesh
 from geomocap.subject.subject_model import MODEL_FILE, SubjectModel, read_model
@@ -58,49 +59,67 @@ def check_run(run: Run, capture: Capture) -> SelfCheck | None:
     needed = (MODEL_FILE, "skeleton.npz", "silhouettes")
     if not capture.is_calibrated or not all((run.path / name).exists() for name in needed):
         return None
-    capture = as_seen(run, capture)
-    skeleton, mesh = read_skeleton(run), model_mesh(read_model(run.path / MODEL_FILE), MESH_TRIANGLES)
+    skeleton, mesh = read_skeleton(run), checked_mesh(read_model(run.path / MODEL_FILE))
     motion = motion_of(skeleton)
     residual = float("nan")
     if (run.path / "diagnostics.npz").exists():
         found = read_diagnostics(run).sample_residuals
         if found is not None and len(found):
             residual = float(np.median(found)) / float(np.linalg.norm(np.ptp(mesh.surface.vertices, axis=0)))
-    views, rig = _views(run, capture), capture.rig.undistorted()
-    return check_result(capture.cameras, _looks(motion), views, rig, mesh, motion, residual)
+    seen = SeenOutlines.of(run, capture)
+    return check_result(capture.cameras, _looks(range(len(motion.rotations))), seen, mesh, motion, residual)
 
 
-def model_overlap(
-    run: Run, capture: Capture, model: SubjectModel, skeleton: Skeleton, frames: range | None = None
-) -> float:
-    """Overlap of a model, drawn in the motion of its skeleton, with a run's silhouettes: the mean over their images.
+def checked_mesh(model: SubjectModel) -> ModelMesh:
+    """Return a model's surface as it is compared with silhouettes."""
+    return model_mesh(model, MESH_TRIANGLES)
+
+
+@dataclass(frozen=True)
+class SeenOutlines:
+    """What the cameras of a run saw of its subject.
+
+    Attributes
+    ----------
+    views : callable
+        `views(frame)`: undistorted silhouettes of all cameras.
+    rig : Rig
+        Undistorted cameras of these.
+    """
+
+    views: Callable[[int], PinholeViews]
+    rig: Rig
+
+    @classmethod
+    def of(cls, run: Run, capture: Capture) -> SeenOutlines:
+        """Return those of a run, by the cameras that it used."""
+        capture = as_seen(run, capture)
+        undistortion = Undistortion.of(capture.rig)
+        return cls(
+            lambda frame: undistortion.views([read_silhouette(run, camera, frame) for camera in capture.cameras]),
+            capture.rig.undistorted(),
+        )
+
+
+def model_overlap(seen: SeenOutlines, mesh: ModelMesh, motion: BodyMotion, frames: range | None = None) -> float:
+    """Overlap of a model, drawn in a motion from its pose, with the silhouettes: the mean over their images.
 
     It says, without any truth, which of several results for one recording, or for some `frames` of it, explains the
     images best.
     """
-    capture = as_seen(run, capture)
-    mesh, motion, views = model_mesh(model, MESH_TRIANGLES), motion_of(skeleton), _views(run, capture)
-    rig = capture.rig.undistorted()
-    looks = _looks(motion) if frames is None else [frames[k] for k in evenly_chosen(len(frames), FRAMES)]
-    return float(np.nanmean([_drawn_overlaps(mesh, motion, views(frame), rig, frame) for frame in looks]))
+    looks = _looks(range(len(motion.rotations)) if frames is None else frames)
+    return float(np.nanmean(map_here(lambda k: _drawn_overlaps(mesh, motion, seen.views(k), seen.rig, k), looks)))
 
 
-def _looks(motion: BodyMotion) -> list[int]:
-    """Return the frames that are looked at."""
-    return evenly_chosen(len(motion.rotations), FRAMES).tolist()
-
-
-def _views(run: Run, capture: Capture) -> Callable[[int], PinholeViews]:
-    """Return what reads the undistorted silhouettes of a frame."""
-    undistortion = Undistortion.of(capture.rig)
-    return lambda frame: undistortion.views([read_silhouette(run, camera, frame) for camera in capture.cameras])
+def _looks(frames: range) -> list[int]:
+    """Return the frames that are looked at, of some."""
+    return [frames[k] for k in evenly_chosen(len(frames), FRAMES)]
 
 
 def check_result(
     cameras: Sequence[str],
     frames: Sequence[int],
-    views: Callable[[int], PinholeViews],
-    rig: Rig,
+    outlines: SeenOutlines,
     mesh: ModelMesh,
     motion: BodyMotion,
     residual: float = np.nan,
@@ -112,10 +131,7 @@ def check_result(
     cameras : sequence of C str
     frames : sequence of F int
         Which to look at.
-    views : callable
-        `views(frame)`: undistorted silhouettes of all cameras.
-    rig : Rig
-        Undistorted cameras of these views.
+    outlines : SeenOutlines
     mesh : ModelMesh
         The subject's surface in the pose of frame 0.
     motion : BodyMotion
@@ -126,8 +142,8 @@ def check_result(
     model = np.full((len(cameras), len(frames)), np.nan)
     left_out = np.full_like(model, np.nan)
     for column, frame in enumerate(frames):
-        seen = views(frame)
-        model[:, column] = _drawn_overlaps(mesh, motion, seen, rig, frame)
+        seen = outlines.views(frame)
+        model[:, column] = _drawn_overlaps(mesh, motion, seen, outlines.rig, frame)
         left_out[:, column] = _left_out_overlaps(seen, _placed(mesh, motion, frame))
     return SelfCheck(tuple(cameras), np.asarray(frames), model, left_out, float(residual))
 

@@ -5,19 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from geomocap.errors import GeometryError
-from geomocap.evaluation.result_check import model_overlap
+from geomocap.evaluation.result_check import SeenOutlines, checked_mesh, model_overlap
 from geomocap.model.frame_geometry import Geometry, GeometryPart
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.motion import Motion
 from geomocap.nodes.surface_coverage import SMALLEST_PIECE
-from geomocap.pipeline.following_stage import model_skeleton
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.window_following import surfaces_of
 from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, body_motion, joint_motion
 from geomocap.subject.model_building import BodyCloud, build_model
 from geomocap.subject.model_following import fit_motion
 from geomocap.subject.subject_model import SubjectModel
-from geomocap.subject.window_motion import joined_motion
+from geomocap.subject.window_motion import joined_motion, motion_of
 
 # Power of what the paths miss, beside what the model's drawn surface misses of the silhouettes. Of two results each of
 # fourteen sets of paths, of thirteen captures, the better was taken with any power from 0.15 to 0.48 in twelve, with
@@ -46,7 +45,7 @@ def make_model(job: Job, geometry: Geometry, motion: Motion) -> SubjectModel | s
 def silhouette_overlap(job: Job, model: SubjectModel, motion: Motion) -> float:
     """Overlap of a motion's model, drawn into the cameras, with the silhouettes: intersection over union, mean."""
     assert job.capture is not None
-    return model_overlap(job.run, job.capture, model, motion.skeleton)
+    return model_overlap(SeenOutlines.of(job.run, job.capture), checked_mesh(model), motion_of(motion.skeleton))
 
 
 def misfit(motion: Motion, overlap: float) -> float:
@@ -75,13 +74,14 @@ def fitted_to_surfaces(
     found = joint_motion(model.linkage, motion.skeleton.body_rotations, motion.skeleton.root_positions)
     bodies, kept = body_motion(model.linkage, found), 0
     with job.run.timed("fit") as count:
+        seen, mesh = SeenOutlines.of(job.run, job.capture), checked_mesh(model)
         for stretch in _stretches(unseen):
             fit = _fitted(job, geometry, model, found, stretch, paths)
             if fit is None:
                 continue
             after = _put_in(model.linkage, bodies, stretch, fit)
-            least = _overlap(job, model, bodies, stretch) + SMALLEST_PIECE
-            if _overlap(job, model, after, stretch) >= least:
+            least = model_overlap(seen, mesh, bodies, stretch) + SMALLEST_PIECE
+            if model_overlap(seen, mesh, after, stretch) >= least:
                 bodies, kept = after, kept + len(stretch)
         count["items"] = int(unseen.sum())
     return (bodies, kept) if kept else None
@@ -124,10 +124,3 @@ def _put_in(linkage: Linkage, bodies: BodyMotion, stretch: range, fit: BodyMotio
     motions = [bodies.part(slice(windows[0].stop)), fit, bodies.part(slice(stretch.stop, None))]
     some = [k for k, window in enumerate(windows) if len(window)]
     return joined_motion(linkage, [windows[k] for k in some], [motions[k] for k in some])
-
-
-def _overlap(job: Job, model: SubjectModel, bodies: BodyMotion, stretch: range) -> float:
-    """Overlap of a moved model with the silhouettes of a stretch."""
-    assert job.capture is not None
-    skeleton = model_skeleton(model, bodies, job.fps)
-    return model_overlap(job.run, job.capture, model.reposed(bodies, 0), skeleton, stretch)

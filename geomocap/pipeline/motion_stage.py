@@ -69,25 +69,26 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     best = candidates[source]
     motion, model = best.motion, best.model
     bodies, found = motion.bodies, motion.connected
-    label = _Label(geometry, job.run, motion)
-    ellipsoids = list(map_items(label, range(frames), job.executor, "labels", job.progress))
-    job.run.note("segmentation", [job.run.frame_file("bodies", k) for k in range(frames)])
-    write_ellipsoids(job.run, Ellipsoids.stack(ellipsoids, np.arange(bodies.body_count, dtype=np.int32)))
-    write_skeleton(job.run, found.skeleton)
     warnings = [*camera_warnings(job.run), *motion.warnings]
     axes = np.array([joint.axis for joint in found.joints]).reshape(-1, 3)
-    if isinstance(model, str):
-        warnings.append(model)
+    fit = None if isinstance(model, str) else fitted_to_surfaces(job, geometry, model, motion, choice[source])
+    if fit is None or isinstance(model, str):
+        label = _Label(geometry, job.run, motion)
+        ellipsoids = list(map_items(label, range(frames), job.executor, "labels", job.progress))
+        job.run.note("segmentation", [job.run.frame_file("bodies", k) for k in range(frames)])
+        write_ellipsoids(job.run, Ellipsoids.stack(ellipsoids, np.arange(bodies.body_count, dtype=np.int32)))
+        write_skeleton(job.run, found.skeleton)
+        if isinstance(model, str):
+            warnings.append(model)
+        else:
+            write_model(job.run.path / MODEL_FILE, model)
     else:
-        write_model(job.run.path / MODEL_FILE, model)
-        fit = fitted_to_surfaces(job, geometry, model, motion, choice[source])
-        if fit is not None:
-            fitted, many = fit
-            write_followed(job, geometry, model, fitted)
-            axes = posed(model.linkage, fitted, 0).axes
-            warnings.append(
-                f"In {many} of {frames} frames no path shows some body; there the model was fitted to the surface."
-            )
+        fitted, many = fit
+        write_followed(job, geometry, model, fitted)
+        axes = posed(model.linkage, fitted, 0).axes
+        warnings.append(
+            f"In {many} of {frames} frames no path shows some body; there the model was fitted to the surface."
+        )
     if warnings:
         write_warnings(job.run, warnings)
     made = Diagnostics(

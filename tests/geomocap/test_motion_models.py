@@ -80,6 +80,7 @@ def case(model, tmp_path):
 def overlaps(monkeypatch, before: float, after: float) -> None:
     """Let the models of the motion found and of the fit overlap the silhouettes so much."""
     values = iter((before, after))
+    monkeypatch.setattr(motion_models.SeenOutlines, "of", lambda *_: None)
     monkeypatch.setattr(motion_models, "model_overlap", lambda *_: next(values))
 
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from geomocap.carving.silhouette_views import Undistortion
 from geomocap.errors import RunError
-from geomocap.evaluation.result_check import check_result
+from geomocap.evaluation.result_check import SeenOutlines, check_result
 from geomocap.files.check_file import read_self_check, write_self_check
 from geomocap.files.run import Run
 from geomocap.model.self_check import SelfCheck
@@ -56,7 +56,7 @@ def check(rig, turns=TURNS, order=None, blind=None):
     skin = SkinPoints.of_weights(surface.vertices, np.ones((len(surface.vertices), 1)))
     motion = BodyMotion(turns[:, None], np.zeros((len(turns), 1, 3)))
     mesh = ModelMesh(surface, skin, np.zeros((0, 3), np.uint8))
-    return check_result(rig.names, FRAMES, views, rig.undistorted(), mesh, motion)
+    return check_result(rig.names, FRAMES, SeenOutlines(views, rig.undistorted()), mesh, motion)
 
 
 def test_what_is_right_agrees_with_every_camera(rig):
