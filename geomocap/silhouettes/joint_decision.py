@@ -15,8 +15,8 @@ from geomocap.silhouettes.evidence import background_misfit, smooth_evidence
 from geomocap.silhouettes.light import light_change
 from geomocap.silhouettes.likelihood import (
     CLASSES,
-    DEPTHS,
     SHADED,
+    SIZES,
     SURE,
     UNSHADED,
     Counts,
@@ -25,8 +25,9 @@ from geomocap.silhouettes.likelihood import (
     count_shaded,
     log_odds,
     shared_noise,
+    size_class,
 )
-from geomocap.silhouettes.other_cameras import FINEST, OtherCameras, agreement, depth_of
+from geomocap.silhouettes.other_cameras import OtherCameras, Word, agreement
 from geomocap.silhouettes.outline import refine_outline
 from geomocap.silhouettes.pieces import clean
 from geomocap.silhouettes.shadows import shadow_misfit
@@ -104,14 +105,14 @@ class Decision:
         Log odds of each pixel from its own camera alone.
     voted : tuple of C arrays (H, W) float32
         The same with the neighbours' vote.
-    words : tuple of C arrays (H, W) float32, or None
+    words : tuple of C Word, or None
         What the others say; None if they can't confirm anything.
     """
 
     masks: tuple[np.ndarray, ...]
     own: tuple[np.ndarray, ...]
     voted: tuple[np.ndarray, ...]
-    words: tuple[np.ndarray, ...] | None
+    words: tuple[Word, ...] | None
 
 
 def decide(
@@ -145,9 +146,8 @@ def decide(
     for c, view in enumerate(views):
         odds, vote, said = own[c], voted[c], None
         if words is not None:
-            said = words[c]
-            bonus = np.append(0.0, likelihood.bonus[c]).astype(np.float32)[_depth(said, len(views))]
-            word = np.minimum(said, bonus)
+            said = words[c].odds
+            word = np.minimum(said, likelihood.bonus(words[c].size))
             odds, vote = odds + word, vote + word
         masks.append(_finish(view, vote > 0, odds, said, float(likelihood.alike[c]), settings))
     return Decision(tuple(masks), tuple(own), tuple(voted), None if words is None else tuple(words))
@@ -177,7 +177,7 @@ def _finish(
 def count(views: Sequence[CameraEvidence], decision: Decision) -> Counts:
     """Count what a decision holds for certain: the likelihood's noise, colours, and worth of confirmation."""
     misfits, alike = [], []
-    confirmed, shaded = np.zeros((len(views), 2, DEPTHS)), np.zeros((2, CLASSES + 1))
+    confirmed, shaded = np.zeros((2, SIZES)), np.zeros((2, CLASSES + 1))
     colors: np.ndarray | float = 0.0
     for c, (view, mask, own, vote) in enumerate(zip(views, decision.masks, decision.own, decision.voted, strict=True)):
         reach = 2 * round(APART * max(mask.shape)) + 1
@@ -188,11 +188,11 @@ def count(views: Sequence[CameraEvidence], decision: Decision) -> Counts:
             certain &= view.region
         if decision.words is not None:
             word = decision.words[c]
-            agreed = word >= agreement(len(views))
+            agreed = word.odds >= agreement(len(views))
             certain &= ~agreed
-            sure &= word >= 0
-            depth = _depth(word, len(views))
-            confirmed[c] = [np.bincount(depth[agreed & a], minlength=DEPTHS + 1)[1:] for a in (vote < -CERTAIN, sure)]
+            sure &= word.odds >= 0
+            classes = size_class(word.size)
+            confirmed += [np.bincount(classes[agreed & a], minlength=SIZES) for a in (vote < -CERTAIN, sure)]
             near = bounding_slices(mask, reach * 4)
             inner = cv2.erode(agreed.view(np.uint8), np.ones((reach // 2, reach // 2), np.uint8)).view(bool)
             shaded += [count_shaded(view.shade, fits & a, a) for a in (_within(certain, near), inner)]
@@ -200,11 +200,6 @@ def count(views: Sequence[CameraEvidence], decision: Decision) -> Counts:
         alike.append([shared_noise(own, certain), 1.0])
         colors = colors + count_colors(view.image, sure & ~fits)
     return Counts(np.array(misfits), np.asarray(colors), shaded, confirmed, np.array(alike))
-
-
-def _depth(word: np.ndarray, cameras: int) -> np.ndarray:
-    """Depth of each pixel in what the others confirm."""
-    return depth_of(word >= agreement(cameras), FINEST * max(word.shape))
 
 
 def _within(mask: np.ndarray, part: tuple[slice, slice]) -> np.ndarray:

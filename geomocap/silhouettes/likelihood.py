@@ -15,7 +15,7 @@ from numba import njit
 from geomocap.silhouettes.background import BackgroundModel
 from geomocap.silhouettes.colors import LEVEL, LEVELS, color_density
 
-DEPTHS = 5  # classes of depth in what the other cameras confirm
+SIZES = 8  # classes of the size of what the other cameras confirm: up to 1/2 voxel, 1, 2, 4 …
 SURE = 6.0  # no pixel counts for more than exp(6) : 1 either way
 OUTLIER = 5e-3  # fraction of the background's pixels that can have any colour
 UNKNOWN = 1.0  # log odds where the background was never seen: something stood before it all the time
@@ -44,9 +44,9 @@ class Counts:
     shaded : (2, CLASSES + 1) float
         Pixels of certain background round the subject, and of subject that the other cameras confirm, all cameras
         together: that fit a shadow, by class of its misfit, and all of them.
-    confirmed : (C, 2, K) float
-        Of the pixels that the other cameras confirm, by depth in these: those that their own camera is sure are
-        background, and subject.
+    confirmed : (2, SIZES) float
+        Of the pixels that the other cameras confirm, all cameras together, by the size of what they confirm: those that
+        their own camera is sure are background, and subject.
     alike : (C, 2) float
         Sum over frames of how many pixels fraction their noise, and the number of frames that it was measured in.
     """
@@ -80,8 +80,8 @@ class Likelihood:
     shadow : (CLASSES,) float
         Log odds of a pixel that fits a shadow by its misfit, in all cameras; infinite: there are no shadows to be
         looked for.
-    bonus : (C, K) float
-        Log odds that a pixel is subject if the other cameras confirm it, by its depth in what they do.
+    worth : (SIZES,) float
+        Log odds that a pixel is subject if the other cameras confirm it, by class of size.
     alike : (C,) float
         How many neighbouring pixels fraction their noise: 1 if it is independent.
     """
@@ -89,8 +89,18 @@ class Likelihood:
     background: np.ndarray
     subject: np.ndarray
     shadow: np.ndarray
-    bonus: np.ndarray
+    worth: np.ndarray
     alike: np.ndarray
+
+    def bonus(self, size: np.ndarray) -> np.ndarray:
+        """Log odds of pixels by the size (H, W) of what the other cameras confirm there; 0 where that is nothing.
+
+        The worth of a class is reached at its end only: its smaller ones are worth less.
+        """
+        result = np.zeros(size.shape, np.float32)
+        confirmed = size > 0
+        result[confirmed] = np.interp(_octaves(size[confirmed]), np.arange(SIZES) - 1.0, self.worth)
+        return result
 
     @classmethod
     def unlearnt(cls, cameras: int, alone: bool = True) -> Likelihood:
@@ -98,7 +108,7 @@ class Likelihood:
         misfit = (np.arange(QUARTERS) + 0.5) / 4
         normal = np.tile((-misfit - 1.5 * np.log(2 * np.pi)).astype(np.float32), (cameras, 1))
         shadow = (ALONE if alone else ASKED) + (np.arange(CLASSES) + 0.5) * (SHADED / CLASSES)
-        return cls(normal, color_density(np.zeros(LEVELS**3)), shadow, np.zeros((cameras, DEPTHS)), np.ones(cameras))
+        return cls(normal, color_density(np.zeros(LEVELS**3)), shadow, np.zeros(SIZES), np.ones(cameras))
 
     @classmethod
     def of(cls, counts: Counts) -> Likelihood:
@@ -108,13 +118,19 @@ class Likelihood:
             misfit_density(n) if n.sum() > 0 else b for n, b in zip(counts.misfits, first.background, strict=True)
         ]
         shadow = shadow_odds(counts.shaded) if counts.shaded.any() else first.shadow
-        miss, hit = counts.confirmed[:, 0], counts.confirmed[:, 1]
-        worth = np.maximum.accumulate(np.log((hit + 1) / (miss + 1)).clip(0, SURE), axis=1)
-        bonus = np.concatenate(
-            [np.zeros((len(worth), 1)), worth[:, :-1]], axis=1
-        )  # a class's outer parts are worth less
+        behind, before = counts.confirmed
+        worth = np.maximum.accumulate(np.log((before + 1) / (behind + 1)).clip(0, SURE))
         alike = np.where(counts.alike[:, 1] > 0, counts.alike[:, 0] / np.maximum(counts.alike[:, 1], 1), 1.0)
-        return cls(np.array(background, np.float32), color_density(counts.colors), shadow, bonus, alike)
+        return cls(np.array(background, np.float32), color_density(counts.colors), shadow, worth, alike)
+
+
+def size_class(size: np.ndarray) -> np.ndarray:
+    """Class of the size of what the other cameras confirm, voxels."""
+    return np.asarray(np.clip(np.floor(_octaves(size)) + 2, 0, SIZES - 1).astype(np.int64))
+
+
+def _octaves(size: np.ndarray) -> np.ndarray:
+    return np.asarray(np.log2(np.maximum(size, 0.25)))
 
 
 def shadow_odds(counts: np.ndarray) -> np.ndarray:

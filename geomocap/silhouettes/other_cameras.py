@@ -8,7 +8,9 @@ say
         = log ((1 - MISSED) e^o + MISSED) - log (CROSSED e^o + 1 - CROSSED)
 
 Undecided pixels say nothing, nor do cameras that don't see the voxel if their image cuts the subject off. The word of
-the others on a pixel is their sum for the voxel on its ray that they confirm best.
+the others on a pixel is their sum for the voxel on its ray that they confirm best. How sure it is that the subject is
+there depends on how large what they confirm is around that ray: by its width across the ray and its length along it.
+Space that no camera looks into is thin.
 
 References
 ----------
@@ -31,7 +33,7 @@ from geomocap.carving.silhouette_views import PinholeViews, Undistortion, pad
 from geomocap.carving.subject_bounds import SMALLEST_PART, halve, space_seen
 from geomocap.carving.voxel_grid import Grid
 from geomocap.model.rig import Rig
-from geomocap.silhouettes.likelihood import DEPTHS, SURE
+from geomocap.silhouettes.likelihood import SURE
 
 MISSED = 0.02  # how often a camera takes a pixel of the subject for background
 CROSSED = 0.3  # how often a ray near the subject meets it elsewhere
@@ -39,7 +41,6 @@ RESOLUTION = 96  # voxels along the subject
 LONGEST = 480  # longer side of the images that are asked, pixels
 MARGIN = 0.04  # of the longest side of the subject's box
 TOLERANT = 4  # from so many cameras on the box may be bounded by all but one
-FINEST = 0.005  # where the second of them begins, part of the image's longer side
 STEPS = 16.0  # of a say, per unit of log odds
 NOWHERE = -12.0  # word on pixels before which the others see no common volume at all
 CELLS, MOST_CELLS = 24, 30_000  # of that box along the subject, and in all
@@ -71,6 +72,13 @@ class Reduced:
     origin: np.ndarray
     rays: np.ndarray
 
+    def voxel(self, grid: Grid) -> float:
+        """Return how large a voxel in the middle of a grid looks, reduced pixels."""
+        row, column = self.rays.shape[0] // 2, self.rays.shape[1] // 2
+        apart = float(np.linalg.norm(self.rays[row, column] - self.rays[row, column - 1]))
+        middle = grid.origin + 0.5 * grid.voxel_size * np.array(grid.shape)
+        return grid.voxel_size / (apart * float(np.linalg.norm(middle - self.origin)))
+
     def shrink(self, image: np.ndarray) -> np.ndarray:
         """Reduce an image (H, W) of this camera."""
         w, h = self.size
@@ -81,6 +89,22 @@ class Reduced:
         w, h = self.size
         full = np.asarray(cv2.resize(image, (w, h), interpolation=cv2.INTER_LINEAR))
         return np.pad(full, ((0, shape[0] - h), (0, shape[1] - w)), mode="edge") if full.shape != shape else full
+
+
+@dataclass(frozen=True)
+class Word:
+    """What the other cameras say of one camera's pixels.
+
+    Attributes
+    ----------
+    odds : (H, W) float32
+        Log odds of the voxel on a pixel's ray that they confirm best.
+    size : (H, W) float32
+        How large what they confirm is around the ray, voxels: geometric mean of its width and its length; 0: nothing.
+    """
+
+    odds: np.ndarray
+    size: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -126,7 +150,7 @@ class OtherCameras:
             cameras.append(Reduced(step, whole, (small[0], small[1]), np.array(origin), rays))
         return cls(rig.names, tuple(cameras), np.array(projections), pad(valid))
 
-    def words(self, odds: list[np.ndarray]) -> list[np.ndarray] | None:
+    def words(self, odds: list[np.ndarray]) -> list[Word] | None:
         """Ask the other cameras.
 
         Parameters
@@ -136,9 +160,8 @@ class OtherCameras:
 
         Returns
         -------
-        list of C arrays (H, W) float32, or None
-            The others' log odds on each pixel. None if they see no common volume, or one
-            without end: then nobody can confirm anything.
+        list of C Word, or None
+            None if they see no common volume, or one without end: then nobody can confirm anything.
         """
         small = [camera.shrink(o) for camera, o in zip(self.cameras, odds, strict=True)]
         views, flat = self._views(small)
@@ -152,12 +175,16 @@ class OtherCameras:
         volume = np.empty((len(small), *grid.shape), np.int8)
         gather(self.projections, says, beyond, grid.origin, grid.voxel_size, volume)
         total = volume.sum(axis=0, dtype=np.int16)
-        enough = int(STEPS * max(SURE, agreement(len(small))))
+        least = STEPS * agreement(len(small))
+        enough = int(max(STEPS * SURE, least))
         result = []
         for c, camera in enumerate(self.cameras):
             others = total - volume[c]
-            word = best_on_rays(camera.origin, camera.rays, others, grid.origin, grid.voxel_size, enough)
-            result.append(camera.enlarge(word, odds[c].shape))
+            about = camera.origin, camera.rays, others, grid.origin, grid.voxel_size
+            word, length = best_on_rays(*about, least, enough)
+            width = 2.0 * cv2.distanceTransform((length > 0).view(np.uint8), cv2.DIST_L2, 3) / camera.voxel(grid)
+            size = np.sqrt(width * length)
+            result.append(Word(*(camera.enlarge(image, odds[c].shape) for image in (word, size))))
         return result
 
     def _views(self, small: list[np.ndarray]) -> tuple[PinholeViews, np.ndarray]:
@@ -232,22 +259,6 @@ def agreement(cameras: int) -> float:
     return 0.5 * YES * (cameras - 1)
 
 
-def depth_of(agreed: np.ndarray, scale: float) -> np.ndarray:
-    """How deep each pixel lies in what the others confirm, (H, W) uint8: 0 outside, class 1 … DEPTHS inside.
-
-    Each class begins twice as deep as the one before.
-
-    Parameters
-    ----------
-    agreed : (H, W) bool
-    scale : float
-        Least depth of class 2, pixels.
-    """
-    distance = cv2.distanceTransform(agreed.view(np.uint8), cv2.DIST_L2, 3)
-    limits = scale * 2.0 ** np.arange(DEPTHS - 1)
-    return np.asarray((distance > 0).astype(np.uint8) + sum((distance >= d).astype(np.uint8) for d in limits))
-
-
 def say(odds: np.ndarray) -> np.ndarray:
     """What a camera with these log odds says of a voxel, in STEPS per unit of log odds, int8.
 
@@ -297,8 +308,8 @@ def gather(P, says, beyond, origin, edge, volume):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def best_on_rays(origin, rays, others, low, edge, enough):
-    """Largest sum of what the other cameras say of a voxel on each ray.
+def best_on_rays(origin, rays, others, low, edge, least, enough):
+    """Largest sum of what the other cameras say of a voxel on each ray, and how many voxels they confirm.
 
     Parameters
     ----------
@@ -309,15 +320,19 @@ def best_on_rays(origin, rays, others, low, edge, enough):
     low : (3,) float
         Lowest corner of the grid.
     edge : float
+    least : float
+        Sum from which a voxel is confirmed.
     enough : int
         Sum beyond which more makes no difference.
 
     Returns
     -------
-    (H, W) float32
+    best : (H, W) float32
         Log odds; NOWHERE at least and on rays that miss the grid.
+    length : (H, W) float32
+        Voxels.
     """
-    result = np.empty(rays.shape[:2], np.float32)
+    result, length = np.empty(rays.shape[:2], np.float32), np.empty(rays.shape[:2], np.float32)
     shape = others.shape
     columns, cells = np.uint32(shape[1]), np.uint32(shape[2])
     flat = others.ravel()
@@ -330,7 +345,7 @@ def best_on_rays(origin, rays, others, low, edge, enough):
                 d = ray[axis] if abs(ray[axis]) >= 1e-9 else 1e-9
                 t0, t1 = (low[axis] - origin[axis]) / d, (low[axis] + shape[axis] * edge - origin[axis]) / d
                 near, far = max(near, min(t0, t1)), min(far, max(t0, t1))
-            best = np.int64(NOWHERE * STEPS)
+            best, confirmed = np.int64(NOWHERE * STEPS), 0
             if near < far:
                 for axis in range(3):
                     start[axis] = (origin[axis] + near * ray[axis] - low[axis]) / edge
@@ -341,14 +356,15 @@ def best_on_rays(origin, rays, others, low, edge, enough):
                 while n < last and not _inside(start, ray, last + 0.5, shape):
                     last -= 1
                 a, b, c, u, v, w = start[0], start[1], start[2], ray[0], ray[1], ray[2]
-                while n <= last and best < enough:
+                while n <= last:
                     t = n + 0.5
                     i, j, k = np.int32(a + t * u), np.int32(b + t * v), np.int32(c + t * w)
                     at = (np.uint32(i) * columns + np.uint32(j)) * cells + np.uint32(k)
                     best = max(best, np.int64(flat[at]))
+                    confirmed += flat[at] >= least
                     n += 1
-            result[y, x] = best / STEPS
-    return result
+            result[y, x], length[y, x] = min(best, enough) / STEPS, confirmed
+    return result, length
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

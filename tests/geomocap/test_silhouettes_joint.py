@@ -170,7 +170,7 @@ def test_an_empty_stage_is_empty_and_learns_nothing() -> None:
     models, likelihood = scene.learn(others)
     assert not any(m.any() for m in decide(scene.views(models, 0), likelihood, others, SETTINGS).masks)
     np.testing.assert_array_equal(likelihood.subject, color_density(np.zeros(LEVELS**3)))
-    assert (likelihood.bonus == 0).all()
+    assert (likelihood.worth == 0).all()
 
 
 def test_a_camera_that_sees_nobody_bears_no_witness() -> None:
