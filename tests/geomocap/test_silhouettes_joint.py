@@ -17,7 +17,17 @@ from geomocap.model.rig import Rig
 from geomocap.silhouettes.background import BackgroundModel, model_from_plate
 from geomocap.silhouettes.colors import LEVEL, LEVELS, color_density, count_colors
 from geomocap.silhouettes.joint_decision import CameraEvidence, Decision, decide, learn_from
-from geomocap.silhouettes.likelihood import BINS, CLASSES, QUARTERS, Likelihood, log_odds, misfit_density, shared_noise
+from geomocap.silhouettes.likelihood import (
+    BINS,
+    CLASSES,
+    QUARTERS,
+    SURE,
+    Counts,
+    Likelihood,
+    log_odds,
+    misfit_density,
+    shared_noise,
+)
 from geomocap.silhouettes.other_cameras import NOWHERE, STEPS, OtherCameras, best_on_rays, gather, say
 from geomocap.silhouettes.pieces import clean, said_of
 from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
@@ -299,7 +309,7 @@ def test_voxels_and_rays_are_read_as_in_numpy() -> None:
 
     camera = others.cameras[0]
     word = volume[1:].sum(axis=0, dtype=np.int16)
-    best = best_on_rays(camera.origin, camera.rays, word, origin, edge, 10_000)
+    best, _ = best_on_rays(camera.origin, camera.rays, word, origin, edge, 300.0, 10_000)
     steps = np.arange(0, 5, edge / 50)
     for y, x in np.argwhere(best < np.inf)[::37]:
         place = np.floor((camera.origin + steps[:, None] * camera.rays[y, x] - origin) / edge).astype(int)
@@ -308,25 +318,81 @@ def test_voxels_and_rays_are_read_as_in_numpy() -> None:
         assert best[y, x] <= finest + 1e-6  # steps of a whole voxel may pass a corner by, but never invent one
         if len(i) > 400:
             assert best[y, x] > NOWHERE
+    least = float(np.quantile(word, 0.7))
     for enough in (10_000, 20):
-        best = best_on_rays(camera.origin, camera.rays, word, origin, edge, enough)
+        best, length = best_on_rays(camera.origin, camera.rays, word, origin, edge, least, enough)
+        assert 0 < length.max() < 40
         for y, x in np.argwhere(best < np.inf)[::37]:
-            assert best[y, x] == np.float32(_best_on_ray(camera.origin, camera.rays[y, x], word, origin, edge, enough))
+            expected = _best_on_ray(camera.origin, camera.rays[y, x], word, origin, edge, least, enough)
+            assert (best[y, x], length[y, x]) == (np.float32(expected[0]), expected[1])
 
 
-def _best_on_ray(origin: np.ndarray, ray: np.ndarray, word: np.ndarray, low: np.ndarray, edge: float, enough: int):
+def _best_on_ray(
+    origin: np.ndarray, ray: np.ndarray, word: np.ndarray, low: np.ndarray, edge: float, least: float, enough: int
+) -> tuple[float, int]:
     """`best_on_rays` of one ray, step by step from where it meets the grid."""
     ray = ray.astype(float)
     borders = np.sort((np.array([low, low + np.array(word.shape) * edge]) - origin) / ray, axis=0)
     near, far = max(0.0, borders[0].max()), borders[1].min()
-    best = NOWHERE * STEPS
+    best, length = NOWHERE * STEPS, 0
     for n in range(int((far - near) / edge) + 1 if near < far else 0):
         place = (origin + near * ray - low) / edge + (n + 0.5) * ray
         if (place >= 0).all() and (place < word.shape).all():
-            best = max(best, word[tuple(place.astype(int))])
-        if best >= enough:
-            break
-    return best / STEPS
+            said = word[tuple(place.astype(int))]
+            best, length = max(best, said), length + (said >= least)
+    return min(best, enough) / STEPS, length
+
+
+def test_what_is_confirmed_is_as_large_as_it_is_in_space():
+    """A ball that seven of eight cameras are sure of, as the eighth sees it: in voxels, whatever the lens."""
+    rig = ring_rig(8)
+    others = OtherCameras.of(rig)
+    masks = render(rig, [ball((0.0, 0.0, 0.0), 0.3)])
+    words = others.words([np.where(mask, 6.0, -6.0).astype(np.float32) for mask in masks])
+    assert words is not None
+    voxel = 0.6 * (1 + 2 * 0.04) / 96  # the grid goes round the ball
+    for word, mask in zip(words, masks, strict=True):
+        assert (word.size[~cv2.dilate(mask.view(np.uint8), np.ones((15, 15), np.uint8)).view(bool)] == 0).all()
+        assert word.size.max() == pytest.approx(0.6 / voxel, rel=0.25)  # a hull is larger, a box has a margin
+        rows, columns = np.nonzero(mask)
+        assert word.size[int(rows.mean()), int(columns.mean())] > 0.9 * word.size.max()
+
+
+def test_a_large_volume_is_worth_more_than_a_thin_one():
+    counts = Counts(
+        np.zeros((2, len(BINS))),
+        np.zeros(LEVELS**3),
+        np.zeros((2, CLASSES + 1)),
+        np.array([[90.0, 80, 70, 50, 20, 9, 0, 0], [10.0, 20, 70, 100, 400, 900, 999, 0]]),
+        np.ones((2, 2)),
+    )
+    likelihood = Likelihood.of(counts)
+    sizes = np.array([[0.0, 0.3, 0.9, 3.0, 6.0, 12.0, 31.0, 200.0]])
+    bonus = likelihood.bonus(sizes)[0]
+    assert bonus[0] == bonus[1] == 0.0
+    assert (np.diff(bonus) >= 0).all()
+    assert likelihood.bonus(np.array([[8.0]]))[0, 0] == pytest.approx(np.log(401 / 21))  # the end of a class
+    assert bonus[-1] <= SURE
+
+
+def middle(mask: np.ndarray, reach: int) -> tuple[slice, slice]:
+    """The square that goes so far from the middle of what is true."""
+    y, x = (int(np.median(places)) for places in np.nonzero(mask))
+    return np.s_[y - reach : y + reach, x - reach : x + reach]
+
+
+def test_what_looks_like_the_wall_behind_is_no_hole_in_the_subject():
+    """One camera takes a part of the trunk for its wall, in every frame; the others hold far more than a gap there."""
+    rig = ring_rig(8)
+    scene = stage(rig)
+    for images, masks in zip(scene.images, scene.masks, strict=True):
+        images[0][middle(masks[0], 16)] = noisy(
+            scene.walls[0][middle(masks[0], 16)] + scene.rng.normal(0, 2.5, (32, 32, 3)), scene.rng
+        )
+    alone, together = scene.decided(1)
+    part = middle(scene.masks[1][0], 14)
+    assert alone.voted[0][part].mean() < 0  # by itself it sees the wall
+    assert together.masks[0][part].all()
 
 
 def test_a_piece_that_the_others_deny_everywhere_goes() -> None:
