@@ -95,11 +95,13 @@ class Likelihood:
     def bonus(self, size: np.ndarray) -> np.ndarray:
         """Log odds of pixels by the size (H, W) of what the other cameras confirm there; 0 where that is nothing.
 
-        The worth of a class is reached at its end only: its smaller ones are worth less.
+        The worth of a class is reached in the middle of the next one: at outlines sizes are least sure, and more makes
+        these grow. Reached in the middle of the class itself the mean overlap of eight captures would be 0.0008 less,
+        at its end 0.0001, and of small images of a fan 0.0012 less.
         """
         result = np.zeros(size.shape, np.float32)
         confirmed = size > 0
-        result[confirmed] = np.interp(_octaves(size[confirmed]), np.arange(SIZES) - 1.0, self.worth)
+        result[confirmed] = np.interp(_octaves(size[confirmed]), np.arange(SIZES) - 0.5, self.worth)
         return result
 
     @classmethod

@@ -371,7 +371,8 @@ def test_a_large_volume_is_worth_more_than_a_thin_one():
     bonus = likelihood.bonus(sizes)[0]
     assert bonus[0] == bonus[1] == 0.0
     assert (np.diff(bonus) >= 0).all()
-    assert likelihood.bonus(np.array([[8.0]]))[0, 0] == pytest.approx(np.log(401 / 21))  # the end of a class
+    of_four_to_eight = np.log(401 / 21)
+    assert likelihood.bonus(np.array([[8.0 * np.sqrt(2)]]))[0, 0] == pytest.approx(of_four_to_eight)
     assert bonus[-1] <= SURE
 
 
