@@ -77,7 +77,7 @@ class Reduced:
         row, column = self.rays.shape[0] // 2, self.rays.shape[1] // 2
         apart = float(np.linalg.norm(self.rays[row, column] - self.rays[row, column - 1]))
         middle = grid.origin + 0.5 * grid.voxel_size * np.array(grid.shape)
-        return grid.voxel_size / (apart * float(np.linalg.norm(middle - self.origin)))
+        return grid.voxel_size / (apart * max(float(np.linalg.norm(middle - self.origin)), grid.voxel_size))
 
     def shrink(self, image: np.ndarray) -> np.ndarray:
         """Reduce an image (H, W) of this camera."""
