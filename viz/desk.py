@@ -68,7 +68,7 @@ class Desk:
         desks = [Desk(self.folder, self.progress, self.steps) for _ in makers]
         with threads() as executor:
             pairs = list(zip(makers, desks, strict=True))
-            made = [executor.submit(make, desk) for make, desk in reversed(pairs)][::-1]  # the longest first
+            made = [executor.submit(make, desk) for make, desk in reversed(pairs)][::-1]  # later ones take longer
             waiting = set(made)
             try:
                 while waiting:

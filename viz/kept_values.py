@@ -45,6 +45,6 @@ class KeptValues:
 class _Kept:
     """A value, once it is built."""
 
-    lock: Any = field(default_factory=Lock)
+    lock: Lock = field(default_factory=Lock)
     built: bool = False
     value: Any = None

@@ -27,7 +27,7 @@ EMBEDDED_VIDEO = 6_000_000
 """Videos up to this many bytes go into the page; larger ones are linked beside it."""
 
 LARGE_PLOT = 120_000
-"""Plots whose PNG has more bytes are embedded with a small loss, in half the size and a tenth of the time."""
+"""Plots whose PNG has more bytes are embedded with a small loss: four of a demo in 0.3 s, not 1.9 s, and 0.6 MB."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ say
 Undecided pixels say nothing, nor do cameras that don't see the voxel if their image cuts the subject off. The word of
 the others on a pixel is their sum for the voxel on its ray that they confirm best. How sure it is that the subject is
 there depends on how large what they confirm is around that ray: by its width across the ray and its length along it.
-Space that no camera looks into is thin.
+Space that no camera looks into is mostly thin.
 
 References
 ----------
