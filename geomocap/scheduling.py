@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
@@ -76,15 +76,26 @@ def spread(kernel: Callable[..., object], count: int, *arguments: object, few: i
         kernel(0, count, *arguments)
         return
     borders = [count * k // (_PARTS * workers) for k in range(_PARTS * workers + 1)]
-    pool = _pool(os.getpid(), workers)
-    for part in [pool.submit(kernel, a, b, *arguments) for a, b in pairwise(borders) if b > a]:
-        part.result()
+    parts = iter([(a, b) for a, b in pairwise(borders) if b > a])  # threads take the next one from it, one by one
+
+    def work() -> None:
+        for begin, end in parts:
+            kernel(begin, end, *arguments)
+
+    helpers = [_pool(os.getpid(), workers - 1).submit(work) for _ in range(workers - 1)]
+    try:
+        work()
+    finally:  # what is waiting for a thread has nothing to do any more
+        left = [helper for helper in helpers if not helper.cancel()]
+        wait(left)
+    for helper in left:
+        helper.result()
 
 
 @cache
-def _pool(process: int, workers: int) -> ThreadPoolExecutor:
+def _pool(process: int, helpers: int) -> ThreadPoolExecutor:
     """Threads that stay for all kernels of a process: they never wait for each other. A forked one has none of them."""
-    return ThreadPoolExecutor(workers, f"kernels-{process}")
+    return ThreadPoolExecutor(helpers, f"kernels-{process}")
 
 
 def map_here(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:

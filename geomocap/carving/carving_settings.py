@@ -31,6 +31,8 @@ class HullSettings(Settings):
     )
     tolerance: int = Field(default=0, ge=0, description="cameras that may call a voxel background and it stays (count)")
 
+    phantoms: bool = Field(default=True, description="take away pieces of the hull that no silhouette needs")
+
     def views_of(self, cameras: int) -> int:
         """Return how many of so many cameras must have a say of a voxel."""
         return min(self.min_views or max(3, (cameras + 1) // 2), cameras)

@@ -11,6 +11,7 @@ from geomocap.carving.carving_settings import CarvingSettings
 from geomocap.carving.coloring import GREY, voxel_colors
 from geomocap.carving.consistency import carve_inconsistent
 from geomocap.carving.hull import hull
+from geomocap.carving.phantoms import without_phantoms
 from geomocap.carving.silhouette_views import PinholeViews, Undistortion
 from geomocap.carving.volume import working_volume
 from geomocap.carving.voxel_grid import Grid
@@ -94,6 +95,8 @@ def carve_frame(
 
     # Shape from silhouette
     occupancy = hull(views, grid, settings.hull)
+    if settings.hull.phantoms:
+        occupancy = without_phantoms(views, grid, occupancy)
     surface = occupancy.surface_indices()
     if len(surface) == 0:
         check_agreement(views, frame, settings.hull)

@@ -78,7 +78,7 @@ def depth_buffers(views: PinholeViews, grid: Grid, surface: SurfaceVoxels, out: 
     depth = np.empty(views.masks.shape, np.float32) if out is None else out
     depth.fill(np.inf)
     P = views.projections
-    _draw(P, _centers(P), surface.indices, surface.faces, grid.origin, grid.voxel_size, depth)
+    _draw(P, camera_centers(P), surface.indices, surface.faces, grid.origin, grid.voxel_size, depth)
     return depth
 
 
@@ -105,7 +105,7 @@ def observations(
     low, high = np.zeros((N, C, 3), np.uint8), np.zeros((N, C, 3), np.uint8)
     _look(
         views.projections,
-        _centers(views.projections),
+        camera_centers(views.projections),
         views.masks,
         views.valid,
         images,
@@ -130,7 +130,8 @@ def normals(occupancy: Occupancy, surface: np.ndarray) -> np.ndarray:
     return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-6)
 
 
-def _centers(P: np.ndarray) -> np.ndarray:
+def camera_centers(P: np.ndarray) -> np.ndarray:
+    """Centres of cameras with projections (C, 3, 4): (C, 3), metres."""
     return -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[:, :, 0]
 
 
@@ -231,6 +232,14 @@ def _project_cubes(P, center, places, faces, half, size, box, near):
         bottom = np.int32(min(max(np.trunc(v + dv - 0.5), np.floor(v)), H - 1))
         last_row[n] = bottom if drawn else np.int32(-1)
         near[n] = w
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def voxel_boxes(P, center, surface, faces, origin, edge, size, box):
+    """Rectangles (4, N) of surface voxels in one image: first and last column, first and last row; see `_draw`."""
+    _project_cubes(
+        P, center, _places(surface, origin, edge), faces, 0.5 * edge, size, box, np.empty(len(surface), np.float32)
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

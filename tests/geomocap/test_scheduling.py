@@ -63,7 +63,39 @@ def test_parts_of_a_kernels_work_are_all_done_once(monkeypatch, workers, count, 
     if workers == 1 or count <= few:
         assert names <= {threading.current_thread().name}
     else:
-        assert len(names) <= workers and threading.current_thread().name not in names
+        assert 1 <= len(names) <= workers
+
+
+def test_the_caller_and_its_helpers_work_side_by_side(monkeypatch):
+    monkeypatch.setattr(numba, "get_num_threads", lambda: 3)
+    together, met = threading.Barrier(3, timeout=30), set()
+
+    def kernel(begin, end):
+        name = threading.current_thread().name
+        if name not in met:
+            met.add(name)
+            together.wait()
+
+    spread(kernel, 100)
+    assert len(met) == 3 and threading.current_thread().name in met
+
+
+@pytest.mark.parametrize("caller", [True, False])
+def test_an_error_of_the_caller_or_of_a_helper_is_raised_when_all_have_ended(monkeypatch, caller):
+    monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
+    together, own, ended = threading.Barrier(2, timeout=30), threading.current_thread(), []
+
+    def kernel(begin, end):
+        mine = threading.current_thread() is own
+        if begin < 2:  # of 16 parts the first two, by whichever thread
+            together.wait()
+        if mine == caller:
+            raise ValueError("here" if mine else "there")
+        ended.append(begin)
+
+    with pytest.raises(ValueError, match="here" if caller else "there"):
+        spread(kernel, 16)
+    assert len(ended) == 15
 
 
 @pytest.mark.parametrize("count", [0, 1, 7])
