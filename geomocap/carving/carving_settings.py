@@ -30,7 +30,6 @@ class HullSettings(Settings):
         "see the subject, three at least",
     )
     tolerance: int = Field(default=0, ge=0, description="cameras that may call a voxel background and it stays (count)")
-
     phantoms: bool = Field(default=True, description="take away pieces of the hull that no silhouette needs")
 
     def views_of(self, cameras: int) -> int:
