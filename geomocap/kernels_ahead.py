@@ -91,7 +91,7 @@ def compile_listed(entries: Sequence[tuple[str, str, list[Any]]]) -> None:
 
 
 def code_of(kind: Any) -> Any:
-    """Return what stands for one of Numba's types in the list: "int64", "float64:2C" for an array, a list for a tuple.
+    """Return what stands for one of Numba's types in the list: "int64", "none", "float64:2C" for an array, a list for a tuple.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def code_of(kind: Any) -> Any:
         return [code_of(part) for part in kind.types]
     if isinstance(kind, types.Array) and kind.aligned:
         return f"{code_of(kind.dtype)}:{kind.ndim}{kind.layout}{'' if kind.mutable else 'r'}"
-    if isinstance(kind, types.Number | types.Boolean):
+    if isinstance(kind, types.Number | types.Boolean | types.NoneType):
         return str(kind)
     raise TypeError(f"{kind}: is no number, array or tuple")
 

@@ -14,26 +14,26 @@ _AT_ONCE = 20  # frames
 
 # Samples are worked on in lanes, last in all arrays; L are `LANES` of them. Each adds up as its sample alone would.
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _gather(samples, positions, weights, ray, seen, share, total):
-    """Fill in what is known of some samples: (T, 6 L) positions and rays, (T, L) weights, and their sums, (L,)."""
-    total[:] = 1e-12
+def _gather(samples, rows, positions, weights, ray, seen, share, total):
+    """Fill in what is known of samples[rows]: (T, 6 L) positions and rays, (T, L) weights, and their sums, (L,)."""
     for q in range(LANES):
+        total[q] = 1e-12
         for t in range(len(share)):
             share[t, q] = 0.0
             for c in range(6):
                 seen[t, LANES * c + q] = 0.0
-            if q < len(samples):
-                n = samples[q]
+            if q < len(rows):
+                n = samples[rows[q]]
                 share[t, q] = weights[n, t]
                 total[q] += weights[n, t]
                 for c in range(3):
                     seen[t, LANES * c + q] = positions[n, t, c]
-                    if ray.shape[1]:
+                    if ray is not None:
                         seen[t, 3 * LANES + LANES * c + q] = ray[n, t, c]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _places_in_lanes(seen, share, total, with_rays, rotations, translations, places):
+def _places_in_lanes(seen, share, total, ray, rotations, translations, places):
     """Fill in the places (3, L) of samples at rest by one body's motion, as `_place_at_rest` does."""
     part = 1.0 - DEPTH_FRACTION**2
     S, sums = np.zeros((9, LANES)), np.empty(LANES)
@@ -48,7 +48,7 @@ def _places_in_lanes(seen, share, total, with_rays, rotations, translations, pla
         for q in range(LANES):
             w = weight[q] / sums[q]
             x, y, z = now[q] - a, now[LANES + q] - b, now[2 * LANES + q] - c
-            if with_rays:
+            if ray is not None:
                 k, m, n = now[3 * LANES + q], now[4 * LANES + q], now[5 * LANES + q]
                 along = part * x * k + part * y * m + part * z * n
                 x, y, z = x - along * k, y - along * m, z - along * n
@@ -67,7 +67,7 @@ def _places_in_lanes(seen, share, total, with_rays, rotations, translations, pla
     for q in range(LANES):
         for c in range(3):
             place[c] = S[c, q]
-        if with_rays:
+        if ray is not None:
             normal[0, 0], normal[0, 1], normal[0, 2] = S[3, q], S[4, q], S[5, q]
             normal[1, 1], normal[1, 2], normal[2, 2] = S[6, q], S[7, q], S[8, q]
             solve_symmetric(normal, place, place)
@@ -76,7 +76,7 @@ def _places_in_lanes(seen, share, total, with_rays, rotations, translations, pla
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _misses_in_lanes(seen, share, total, with_rays, rotations, translations, places, cap, misses, costs):
+def _misses_in_lanes(seen, share, total, ray, rotations, translations, places, cap, misses, costs):
     """Fill in what one body misses of samples, (T, 3 L), observed minus carried, and its costs (L,)."""
     part = 1.0 - DEPTH_FRACTION
     P, sums = np.empty((3, LANES)), np.zeros(LANES)
@@ -93,7 +93,7 @@ def _misses_in_lanes(seen, share, total, with_rays, rotations, translations, pla
             x = now[q] - (a + r0 * P[0, q] + r1 * P[1, q] + r2 * P[2, q])
             y = now[LANES + q] - (b + r3 * P[0, q] + r4 * P[1, q] + r5 * P[2, q])
             z = now[2 * LANES + q] - (c + r6 * P[0, q] + r7 * P[1, q] + r8 * P[2, q])
-            if with_rays:
+            if ray is not None:
                 k, m, n = now[3 * LANES + q], now[4 * LANES + q], now[5 * LANES + q]
                 along = x * k + y * m + z * n
                 x, y, z = x - part * along * k, y - part * along * m, z - part * along * n
@@ -112,7 +112,8 @@ def _blend_in_lanes(first, second, share, total, penalty, cap, most, fraction, c
     Misses of the bodies are (T, 3 L), `most` is (2, L): where the first, or the second body is the main one.
     """
     S, w = np.zeros((6, LANES)), np.empty(LANES)
-    S[3] = 1e-18
+    for q in range(LANES):
+        S[3, q] = 1e-18
     for t in range(len(share)):
         one, other, weight = first[t], second[t], share[t]
         for q in range(LANES):
@@ -175,15 +176,14 @@ def explain_samples(
     partner,
     fraction,
 ):
-    """Fill the rows `order[L * begin : L * end]` of the results, see `explain`."""
+    """Fill the rows `order[L * begin : L * end]` of the results, see `explain`; `ray` is None where there are none."""
     bodies, frames = len(rotations), weights.shape[1]
-    with_rays = ray.shape[1] > 0
     seen, share, total = np.empty((frames, 6 * LANES)), np.empty((frames, LANES)), np.empty(LANES)
     misses, places = np.empty((bodies, frames, 3 * LANES)), np.empty((3, LANES))
     cost, part, most = np.empty(LANES), np.empty(LANES), np.empty((2, LANES))
     for low in range(LANES * begin, min(LANES * end, len(order)), LANES):
         rows = order[low : low + LANES]
-        _gather(samples[rows], positions, weights, ray, seen, share, total)
+        _gather(samples, rows, positions, weights, ray, seen, share, total)
         for b in range(bodies):
             asked, unsure = False, False
             for row in rows:
@@ -192,13 +192,13 @@ def explain_samples(
             if not asked:
                 continue
             if unsure:
-                _places_in_lanes(seen, share, total, with_rays, rotations[b], translations[b], places)
+                _places_in_lanes(seen, share, total, ray, rotations[b], translations[b], places)
             for q in range(LANES):
                 n = samples[rows[min(q, len(rows) - 1)]]
                 if certain[n]:
                     for c in range(3):
                         places[c, q] = rest[n, c]
-            _misses_in_lanes(seen, share, total, with_rays, rotations[b], translations[b], places, cap, misses[b], cost)
+            _misses_in_lanes(seen, share, total, ray, rotations[b], translations[b], places, cap, misses[b], cost)
             for q, row in enumerate(rows):
                 if allowed[row, b]:
                     costs[row, b] = cost[q]

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from geomocap.model.motion_paths import DEPTH_FRACTION
+from geomocap.model.order_statistics import median
 from geomocap.model.rotations import turn_angles
 from geomocap.model.small_systems import cholesky, nearest_turn, solve
 
@@ -57,7 +58,8 @@ def fit_rigid_motion(
         Root mean square over time.
     """
     positions, rest = np.ascontiguousarray(positions, np.float64), np.ascontiguousarray(rest, np.float64)
-    ray = np.zeros((len(rest), 0, 3)) if ray is None else np.ascontiguousarray(ray, np.float64)
+    if ray is not None:  # what rays take isn't compiled without any
+        ray = np.ascontiguousarray(ray, np.float64)
     given = np.ascontiguousarray(np.maximum(weights, _LEAST_WEIGHT), np.float64)
     return _fit(positions, rest, given, ray, rounds, least_scale)
 
@@ -66,30 +68,31 @@ def fit_rigid_motion(
 # adds up in the order of the samples as it would alone. What is beyond the last frame counts nothing.
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fit(positions, rest, given, ray, rounds, least_scale):
-    """Rotations, translations and residuals, see `fit_rigid_motion`; rays are (n, T, 3), or (n, 0, 3): none."""
+    """Rotations, translations and residuals, see `fit_rigid_motion`; rays are (n, T, 3) or None."""
     count, frames = given.shape
-    starts = _START_ROUNDS if ray.shape[1] else rounds
+    starts, steps = rounds, 0
+    if ray is not None:
+        starts, steps = _START_ROUNDS, rounds
     known, weights, motion = _in_blocks(positions, given, ray)
     robust, squares, residuals = weights.copy(), np.zeros_like(weights), np.zeros(count)
     scale = 0.0
-    for k in range(rounds + (starts if ray.shape[1] else 0)):
+    for k in range(starts + steps):
         for b in range(len(known)):
             if k > 0:
                 _weigh(weights[b], squares[b], residuals, scale, robust[b])
             some = min(_BLOCK, frames - _BLOCK * b)
             if k < starts:
                 _motions(known[b], rest, robust[b], some, motion[b])
-            else:
+            elif ray is not None:
                 _step(known[b], rest, robust[b], some, motion[b])
-            _misses(known[b], rest, motion[b], ray.shape[1] > 0, squares[b])
+            _misses(known[b], rest, motion[b], ray, squares[b])
         for n in range(count):
             total, mean = 0.0, 0.0
             for t in range(frames):
                 total += given[n, t]
                 mean += given[n, t] * squares[t // _BLOCK, n, t % _BLOCK]
             residuals[n] = math.sqrt(mean / total)
-        ordered = np.sort(residuals)
-        scale = 2.0 * max(0.5 * (ordered[(count - 1) // 2] + ordered[count // 2]), least_scale, _LEAST_SCALE)
+        scale = 2.0 * max(median(residuals), least_scale, _LEAST_SCALE)
     rotations, translations = np.empty((frames, 3, 3)), np.empty((frames, 3))
     for t in range(frames):
         for i in range(3):
@@ -114,7 +117,7 @@ def _in_blocks(positions, given, ray):
             weights[b, n, k] = given[n, t]
             for i in range(3):
                 known[b, n, i, k] = positions[n, t, i]
-                if ray.shape[1]:
+                if ray is not None:
                     known[b, n, 3 + i, k] = ray[n, t, i]
     return known, weights, np.zeros((blocks, 12, _BLOCK))
 
@@ -166,7 +169,7 @@ def _motions(known, rest, weights, some, motion):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _misses(known, rest, motion, with_rays, squares):
+def _misses(known, rest, motion, ray, squares):
     """Squares of the sure parts of what a motion misses in the frames of a block, (n, 16), filled."""
     part = 1.0 - DEPTH_FRACTION
     for n in range(len(rest)):
@@ -175,7 +178,7 @@ def _misses(known, rest, motion, with_rays, squares):
             a = motion[9, t] - known[n, 0, t] + motion[0, t] * x + motion[1, t] * y + motion[2, t] * z
             b = motion[10, t] - known[n, 1, t] + motion[3, t] * x + motion[4, t] * y + motion[5, t] * z
             c = motion[11, t] - known[n, 2, t] + motion[6, t] * x + motion[7, t] * y + motion[8, t] * z
-            if with_rays:
+            if ray is not None:
                 along = a * known[n, 3, t] + b * known[n, 4, t] + c * known[n, 5, t]
                 a -= part * along * known[n, 3, t]
                 b -= part * along * known[n, 4, t]

@@ -189,7 +189,7 @@ def explain(
         samples,
         positions,
         weights,
-        ray,
+        ray if ray.size else None,  # what rays take isn't compiled without any
         np.ascontiguousarray(rest),
         np.ascontiguousarray(certain),
         rotations,

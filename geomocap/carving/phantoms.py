@@ -221,7 +221,10 @@ def _pieces(cells, neck):
     flat, own = cells.ravel(), piece.ravel()
     steps = np.array([Y * Z, -Y * Z, Z, -Z, 1, -1])
     # steps to what is empty, at most neck + 1
-    depth = np.minimum(flat, np.uint8(1)) * np.uint8(neck + 1)
+    depth, filled = np.empty_like(flat), 0
+    for n in range(len(flat)):
+        depth[n] = neck + 1 if flat[n] else 0
+        filled += flat[n] != 0
     for n in range(Y * Z, len(flat)):
         if depth[n]:
             depth[n] = min(depth[n], depth[n - Y * Z] + 1, depth[n - Z] + 1, depth[n - 1] + 1)
@@ -229,7 +232,7 @@ def _pieces(cells, neck):
         if depth[n]:
             depth[n] = min(depth[n], depth[n + Y * Z] + 1, depth[n + Z] + 1, depth[n + 1] + 1)
     # fill core after core; then grow all, step by step
-    queue = np.empty(int(np.count_nonzero(flat)), np.int64)
+    queue = np.empty(filled, np.int64)
     count, begin, end = 0, 0, 0
     for start in range(len(flat)):
         if depth[start] <= neck or own[start]:
@@ -268,9 +271,11 @@ def _outside(cells, piece, count):
     Y, Z = cells.shape[1:]
     flat, own = cells.ravel(), piece.ravel()
     steps = np.array([-Y * Z, Y * Z, -Z, Z, -1, 1])
-    surface, faces = np.empty((int(np.count_nonzero(flat)), 3), np.int32), np.empty(len(flat), np.uint8)
+    filled, found = 0, 0
+    for n in range(len(flat)):
+        filled += flat[n] != 0
+    surface, faces = np.empty((filled, 3), np.int32), np.empty(filled, np.uint8)
     touched, whole = np.zeros(count + 1), np.zeros(count + 1)
-    found = 0
     for n in range(len(flat)):
         if flat[n] == 0:
             continue
@@ -284,6 +289,7 @@ def _outside(cells, piece, count):
             surface[found, 0], surface[found, 1], surface[found, 2] = n // (Y * Z), n // Z % Y, n % Z
             faces[found] = bits
             found += 1
-    hanging = touched / np.maximum(whole, 1.0)
-    hanging[0] = np.inf  # what is of no piece is not asked
-    return surface[:found].copy(), faces[:found].copy(), hanging
+    touched[0], whole[0] = np.inf, 1.0  # what is of no piece is not asked
+    for k in range(count + 1):
+        touched[k] /= max(whole[k], 1.0)
+    return surface[:found].copy(), faces[:found].copy(), touched

@@ -114,7 +114,8 @@ def sort_by_cell(points, low, cell, shape):
             c = c * shape[d] + min(int((points[m, d] - low[d]) / cell), shape[d] - 1)
         at[m] = c
         starts[c + 1] += 1
-    starts = np.cumsum(starts)
+    for c in range(len(starts) - 1):
+        starts[c + 1] += starts[c]
     order, filled = np.empty(len(points), np.int64), starts[:-1].copy()
     for m in range(len(points)):
         order[filled[at[m]]] = m

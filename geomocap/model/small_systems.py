@@ -78,8 +78,11 @@ def nearest_turn(M, R):
 
     The identity if M has rank 0 or just 1.
     """
-    U, V = M.copy(), np.eye(3)
+    U, V = M.copy(), np.empty((3, 3))
     lengths = np.empty(3)
+    for i in range(3):
+        for j in range(3):
+            V[i, j] = 1.0 if i == j else 0.0
     for _ in range(30):  # 4 to 6 are enough
         done = True
         for p, q in ((0, 1), (0, 2), (1, 2)):

@@ -100,7 +100,7 @@ def align_patches(
     shape, room, at = np.empty((5, most), np.float32), np.empty((5, most), np.float32), np.empty(most, np.int32)
     shown, T = np.empty((C, most), np.float32), np.empty((C, most), np.float32)
     J = np.empty((C, 6, most), np.float32)
-    camera, A, local = np.empty((3, 4)), np.empty((C, 3, 4), np.float32), np.empty(3, np.float32)
+    A, local = np.empty((C, 3, 4), np.float32), np.empty(3, np.float32)
     counts = np.empty(C, np.int64)
     moments = np.empty((C, 14))
     H = np.empty((C, 6, 6))
@@ -124,8 +124,7 @@ def align_patches(
             counts[c] = 0
             if not use[n, c]:
                 continue
-            local_camera(P[c], x_n, q_n, camera)
-            A[c] = camera
+            local_camera(P[c], x_n, q_n, A[c])
             for r in range(3):
                 to = 0.0
                 for k in range(3):
@@ -150,8 +149,7 @@ def align_patches(
                 if counts[c] == 0:
                     continue
                 if step > 0:
-                    local_camera(P[c], x_n, q_n, camera)
-                    A[c] = camera
+                    local_camera(P[c], x_n, q_n, A[c])
                 known = J[c], T[c], moments[c]
                 product, variance = compare(
                     N, A[c], shape, shown[c], images[c], counts[c], iterations > 0, *known, b[c], at, room

@@ -125,7 +125,7 @@ class Observations:
         weight = 1.0 / sigma[point, frame] ** 2
         numbers = (point + first_point).astype(np.int32)
         if ray is None:
-            up = np.broadcast_to([0.0, 0.0, 1.0], target.shape)
+            up = np.tile([0.0, 0.0, 1.0], (len(target), 1))  # no view: kernels would be compiled for both
             return cls(start, numbers, target, up, weight, np.zeros(len(weight)))
         return cls(start, numbers, target, ray[point, frame], weight, (DEPTH_FRACTION**2 - 1.0) * weight)
 

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from geomocap.model.even_choice import evenly_chosen
 from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.small_systems import nearest_turn
 from geomocap.scheduling import map_here, spread
 
 _COMPANIONS = 48  # of those, mostly few are seen where a sample is not
@@ -102,6 +103,7 @@ def _carry_on(
     filled = positions.copy()
     sure = certainty.copy()
     done = known.copy()
+    rotation = np.empty((3, 3))
     for step in range(1, frames):
         before, now = order[step - 1], order[step]
         # twice: those with companions seen in both frames, then those that only have filled ones
@@ -140,11 +142,7 @@ def _carry_on(
                 trace = moment[0, 0] + moment[1, 1] + moment[2, 2]
                 for c in range(3):
                     moment[c, c] += 0.02 * abs(trace) + 1e-12
-                u, _, vt = np.linalg.svd(moment)
-                if np.linalg.det(u) * np.linalg.det(vt) < 0.0:
-                    for c in range(3):
-                        u[c, 2] *= -1.0
-                rotation = u @ vt
+                nearest_turn(moment, rotation)
                 for c in range(3):
                     value = b[c]
                     for d in range(3):
