@@ -49,15 +49,15 @@ def shadow_misfit(direct, image, mean, sigma, known, gain, offset, darkest, limi
     wide = w + 2 * radius
     picture = np.zeros((RING, 3, wide))  # 0 where unknown, as the next three
     lit = np.zeros((RING, 3, wide), np.float32)
-    ib, bb = np.zeros((RING, wide), np.float32), np.zeros((RING, wide), np.float32)  # sums over channels of I·B and B²
+    ib, bb = np.empty((RING, wide), np.float32), np.empty((RING, wide), np.float32)  # sums over channels of I·B and B²
     # Of each window's row: sums of B², B² u, B² u², I·B, I·B u; of the squares of the channels, and what is known
-    moments, squares = np.zeros((RING, 5, w)), np.zeros((RING, 4, w), np.int32)
-    values, spare = np.zeros((4, wide), np.int32), np.zeros(w)
-    possible = np.zeros((RING, w), np.bool_)
-    count = np.zeros(RING, np.int64)  # of what is possible in a row
-    plane = np.zeros((RING, w, 3), np.float32)  # factor at the window's centre, its slopes along x and y
-    tint = np.zeros((RING, w, 3), np.float32)  # channels' own factors, relative
-    misfit = np.zeros((RING, w), np.float32)
+    moments, squares = np.empty((RING, 5, w)), np.empty((RING, 4, w), np.int32)
+    values, spare = np.zeros((4, wide), np.int32), np.empty(w)
+    possible = np.empty((RING, w), np.bool_)
+    count = np.empty(RING, np.int64)  # of what is possible in a row
+    plane = np.empty((RING, w, 3), np.float32)  # factor at the window's centre, its slopes along x and y
+    tint = np.empty((RING, w, 3), np.float32)  # channels' own factors, relative
+    misfit = np.empty((RING, w), np.float32)
     for step in range(h + 2 * radius):
         if step < h:
             k = step & (RING - 1)
