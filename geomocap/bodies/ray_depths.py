@@ -118,9 +118,9 @@ def settle_depths(paths: MotionPaths, bodies: MotionBodies, outlines: Outlines |
     lone = (paths.ray.any(axis=2) & paths.seen).sum(axis=1) > 0.5 * paths.seen.sum(axis=1)
     own = _blended(paths, weights, rotations, translations, outlines)
     for k in range(_ROUNDS):
-        chosen = _choose(paths, own, label, rest, rotations, translations, outlines)
-        changed = lone & (chosen != label)
-        label = np.where(changed, chosen, label)
+        chosen = _choose(paths, lone, own, label, rest, rotations, translations, outlines)
+        changed = chosen != label
+        label = chosen
         weights = np.where(changed[:, None], np.eye(len(rotations))[label], weights)
         own = _blended(paths, weights, rotations, translations, outlines)
         if k < _ROUNDS - 1:
@@ -143,11 +143,12 @@ def _blended(
 ) -> _RestPlaces:
     """Places of samples that follow their bodies with given weights (N, B)."""
     turns = np.einsum("nb,btij->ntij", weights, rotations)
-    return _place(paths, turns, np.einsum("nb,bti->nti", weights, translations), outlines)
+    return _place(paths, turns, np.einsum("nb,bti->nti", weights, translations), outlines)[1]
 
 
 def _choose(
     paths: MotionPaths,
+    asked: np.ndarray,
     own: _RestPlaces,
     label: np.ndarray,
     rest: np.ndarray,
@@ -155,16 +156,20 @@ def _choose(
     translations: np.ndarray,
     outlines: Outlines | None,
 ) -> np.ndarray:
-    """Largest of the bodies that explain each sample, (N,) int; that which it has if there is none nearby."""
+    """Largest of the bodies that explain each sample, (N,) int; that which it has if there is none nearby.
+
+    Only samples `asked` (N,) bool may choose.
+    """
     assert paths.ray is not None
     count = len(rotations)
     misses, outside = np.full((len(label), count), np.inf), np.ones((len(label), count))
     alone = np.maximum((paths.ray.any(axis=2) & paths.seen).sum(axis=1), 1)
     for b in range(count):
-        found = _place(paths, rotations[b : b + 1], translations[b : b + 1], outlines)
-        near = cKDTree(rest[label == b]).query(found.rest)[0] < _LOCAL * paths.diagonal
-        before = found.depth.sum(axis=1) / alone < -_BEFORE * paths.diagonal
-        misses[:, b], outside[:, b] = np.where(near & ~before, found.miss, np.inf), found.outside
+        body = cKDTree(rest[label == b])
+        some, found = _place(paths, rotations[b : b + 1], translations[b : b + 1], outlines, asked, body)
+        near = body.query(found.rest)[0] < _LOCAL * paths.diagonal
+        before = found.depth.sum(axis=1) / alone[some] < -_BEFORE * paths.diagonal
+        misses[some, b], outside[some, b] = np.where(near & ~before, found.miss, np.inf), found.outside
     # a motion that carries a sample out of silhouettes in which another one keeps it is not its own
     misses[outside > outside.min(axis=1, keepdims=True) + MAY_MISS] = np.inf
     best = misses.min(axis=1)
@@ -203,33 +208,50 @@ def _refit(
 
 
 def _place(
-    paths: MotionPaths, rotations: np.ndarray, translations: np.ndarray, outlines: Outlines | None
-) -> _RestPlaces:
+    paths: MotionPaths,
+    rotations: np.ndarray,
+    translations: np.ndarray,
+    outlines: Outlines | None,
+    asked: np.ndarray | None = None,
+    body: cKDTree | None = None,
+) -> tuple[np.ndarray, _RestPlaces]:
     """Find where samples lie at rest, if motions (N or 1, T, 3, 3), (N or 1, T, 3) carry them.
 
-    With silhouettes their depths are not those of each frame's hull, but of the hull of all frames.
+    With silhouettes their depths are not those of each frame's hull, but of the hull of all frames. Of `asked`
+    samples, (N,) bool, those are left out that can't come near a `body` at any depth. Returns which are left, too.
     """
     assert paths.ray is not None
-    positions, ray = np.nan_to_num(paths.positions), np.ascontiguousarray(paths.ray, np.float64)
+    diagonal, some = paths.diagonal, np.arange(paths.count) if asked is None else np.flatnonzero(asked)
     motions = np.ascontiguousarray(rotations), np.ascontiguousarray(translations)
-    diagonal = paths.diagonal
     largest = _LARGEST * diagonal
-    found = _RestPlaces(
-        *place_samples(positions, paths.seen, ray, *motions, _DEPTH_FRACTION, largest), np.zeros(paths.count)
-    )
+
+    def places(moved: np.ndarray, depth_fraction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return place_samples(moved, paths.seen[some], ray, *motions, depth_fraction, largest)
+
+    positions, ray = np.nan_to_num(paths.positions[some]), np.ascontiguousarray(paths.ray[some], np.float64)
+    rest, miss, depth = places(positions, _DEPTH_FRACTION)
     if outlines is None:
-        return found
-    seen_along = np.where(paths.seen[..., None], ray, 0.0)
+        return some, _RestPlaces(rest, miss, depth, np.zeros(len(some)))
+    seen_along = np.where(paths.seen[some][..., None], ray, 0.0)
     inward = np.einsum("ntji,ntj->ni", np.broadcast_to(rotations, (*ray.shape, 3)), seen_along)
     length = np.linalg.norm(inward, axis=1, keepdims=True)
     inward /= np.where(length > 0, length, 1.0)
-    shift, outside = hull_fronts(found.rest, inward, *motions, outlines, _STEP * diagonal, _REACH * diagonal)
-    front = found.rest + shift[:, None] * inward
+    if body is not None:
+        close = _comes_near(rest, inward, body, diagonal)
+        some, positions, ray, rest, inward = (a[close] for a in (some, positions, ray, rest, inward))
+    shift, outside = hull_fronts(rest, inward, *motions, outlines, _STEP * diagonal, _REACH * diagonal)
+    front = rest + shift[:, None] * inward
     carried = np.einsum("ntij,nj->nti", np.broadcast_to(rotations, (*ray.shape, 3)), front) + translations
-    deeper = np.where(paths.seen, ((carried - positions) * ray).sum(axis=2), 0.0)
-    moved = positions + deeper[..., None] * ray
-    again = _RestPlaces(*place_samples(moved, paths.seen, ray, *motions, _FRONT_FRACTION, largest), outside)
-    return replace(again, depth=deeper + again.depth)
+    deeper = np.where(paths.seen[some], ((carried - positions) * ray).sum(axis=2), 0.0)
+    rest, miss, depth = places(positions + deeper[..., None] * ray, _FRONT_FRACTION)
+    return some, _RestPlaces(rest, miss, deeper + depth, outside)
+
+
+def _comes_near(rest: np.ndarray, inward: np.ndarray, body: cKDTree, diagonal: float) -> np.ndarray:
+    """Whether lines of sight (N, 3), looked along for fronts, come near a body, (N,) bool."""
+    along = np.arange(-_REACH, _REACH + _LOCAL, _LOCAL) * diagonal
+    nearest = body.query(rest[:, None] + along[:, None] * inward[:, None])[0].min(axis=1)
+    return nearest < (_LOCAL + 0.5 * _LOCAL) * diagonal
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
