@@ -91,7 +91,9 @@ def compile_listed(entries: Sequence[tuple[str, str, list[Any]]]) -> None:
 
 
 def code_of(kind: Any) -> Any:
-    """Return what stands for one of Numba's types in the list: "int64", "none", "float64:2C" for an array, a list for a tuple.
+    """Return what stands for one of Numba's types in the list.
+
+    "int64", "none", "float64:2C" for an array, a list for a tuple.
 
     Raises
     ------
