@@ -28,6 +28,10 @@ from viz.sheets import overlay, picture, tile_size
 from viz.viewpoints import ViewStage
 
 
+SMOOTH_FPS = 30.0
+"""Frames a second that look smooth."""
+
+
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, quality: int = 23) -> None:
     """Write frames, (H, W, 3) uint8 RGB all of one size, as MP4, whole or not at all.
 
@@ -98,7 +102,7 @@ def motion_video(
     path : Path
         An MP4 file.
     at_most : int
-        Longer sequences are thinned out, and the frame rate with them.
+        Longer sequences are thinned out, and the frame rate with them; so are those of more than 30 frames a second.
     progress : Progress
     turn_deg : float
         How far the free view turns over the video, degrees.
@@ -110,9 +114,10 @@ def motion_video(
         If there are no frames or the file can't be written.
     """
     look = look or Look()
-    step = max(1, -(-len(results.frames) // at_most))
+    rate = results.fps or 15.0
+    step = max(1, -(-len(results.frames) // at_most), int(rate / SMOOTH_FPS))
     frames = results.frames[::step]
-    fps = max(1.0, (results.fps or 15.0) / step)
+    fps = max(1.0, rate / step)
     camera = best_camera(results, stage)
     size = tile_size(stage, 0, 12, 95_000)
     size = (max(size[0], 240), size[1])
