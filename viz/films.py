@@ -27,7 +27,6 @@ from viz.run_contents import Results
 from viz.sheets import overlay, picture, tile_size
 from viz.viewpoints import ViewStage
 
-
 SMOOTH_FPS = 30.0
 """Frames a second that look smooth."""
 
