@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial import cKDTree
 
 from geomocap.bodies import ray_depths as ray_depths
 from geomocap.bodies.body_settings import MotionBodiesSettings
@@ -180,11 +181,23 @@ def test_a_body_that_leaves_the_silhouettes_is_not_chosen(three, alone, bodies):
             empty[t, 0, y - 3 : y + 4, x - 3 : x + 4] = 0
     outlines = Outlines(np.arange(len(empty)), P, empty)
     motions = bodies.rotations.swapaxes(0, 1), bodies.translations.swapaxes(0, 1)
-    outside = [ray_depths._place(alone, r[None], t[None], outlines).outside for r, t in zip(*motions, strict=True)]
+    outside = [ray_depths._place(alone, r[None], t[None], outlines)[1].outside for r, t in zip(*motions, strict=True)]
     own = three.body == 0
     missed = [float(np.median(o[own])) for o in outside]
     assert missed[first] < 0.05 < max(missed), missed
     assert np.argmin(missed) == first
+
+
+def test_lines_of_sight_that_come_near_a_body_at_some_depth_are_kept_and_far_ones_are_not():
+    rng = np.random.default_rng(0)
+    body, rest, inward = (rng.normal(size=(n, 3)) for n in (30, 400, 400))
+    body, inward = 0.1 * body, inward / np.linalg.norm(inward, axis=1, keepdims=True)
+    depths = np.linspace(-ray_depths._REACH, ray_depths._REACH, 301)
+    nearest = cKDTree(body).query(rest[:, None] + depths[:, None] * inward[:, None])[0].min(axis=1)
+    kept = ray_depths._comes_near(rest, inward, cKDTree(body), 1.0)
+    assert kept[nearest < ray_depths._LOCAL].all()
+    assert not kept[nearest > 2.5 * ray_depths._LOCAL].any()
+    assert 0 < kept.sum() < len(kept)
 
 
 def test_depths_repeat_bit_for_bit(alone, bodies):
