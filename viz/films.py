@@ -28,7 +28,7 @@ from viz.sheets import overlay, picture, tile_size
 from viz.viewpoints import ViewStage
 
 SMOOTH_FPS = 30.0
-"""Frames a second that look smooth."""
+"""Frames a second that look smooth: films are seldom made with more."""
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, quality: int = 23) -> None:
@@ -83,6 +83,11 @@ def best_camera(results: Results, stage: ViewStage) -> str | None:
     return rig.names[int(np.argmax(side * np.array(inside)))]
 
 
+def thinning(frames: int, fps: float, at_most: int) -> int:
+    """Return how many frames of a recording a film goes on by: it has few enough, and about `SMOOTH_FPS` at most."""
+    return max(1, -(-frames // at_most), round(fps / SMOOTH_FPS))
+
+
 def motion_video(
     results: Results,
     stage: ViewStage,
@@ -101,7 +106,7 @@ def motion_video(
     path : Path
         An MP4 file.
     at_most : int
-        Longer sequences are thinned out, and the frame rate with them; so are those of more than 30 frames a second.
+        Longer sequences are thinned out, and the frame rate with them; so are faster ones, to about `SMOOTH_FPS`.
     progress : Progress
     turn_deg : float
         How far the free view turns over the video, degrees.
@@ -114,7 +119,7 @@ def motion_video(
     """
     look = look or Look()
     rate = results.fps or 15.0
-    step = max(1, -(-len(results.frames) // at_most), int(rate / SMOOTH_FPS))
+    step = thinning(len(results.frames), rate, at_most)
     frames = results.frames[::step]
     fps = max(1.0, rate / step)
     camera = best_camera(results, stage)

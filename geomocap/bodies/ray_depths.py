@@ -248,7 +248,10 @@ def _place(
 
 
 def _comes_near(rest: np.ndarray, inward: np.ndarray, body: cKDTree, diagonal: float) -> np.ndarray:
-    """Whether lines of sight (N, 3), looked along for fronts, come near a body, (N,) bool."""
+    """Whether lines of sight (N, 3), looked along for fronts, come near a body, (N,) bool.
+
+    Each is looked at in places so far apart that none of it is farther than half of that from one of them.
+    """
     along = np.arange(-_REACH, _REACH + _LOCAL, _LOCAL) * diagonal
     nearest = body.query(rest[:, None] + along[:, None] * inward[:, None])[0].min(axis=1)
     return nearest < (_LOCAL + 0.5 * _LOCAL) * diagonal

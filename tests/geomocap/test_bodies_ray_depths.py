@@ -171,21 +171,43 @@ def test_where_silhouettes_say_nothing_depths_are_those_of_the_motion(three, alo
     assert_allclose(settled, settle_depths(alone, bodies).positions, atol=0.005)
 
 
-def test_a_body_that_leaves_the_silhouettes_is_not_chosen(three, alone, bodies):
+@pytest.fixture(scope="module")
+def seen_from_above(three) -> Outlines:
     """A camera from above whose image is empty but where the first body's samples are in the frames."""
-    first = int(bodies.label[three.body == 0][0])
     P = np.array([[[100.0, 0, 0, 500], [0, 100.0, 0, 500], [0, 0, 0, 1.0]]])  # parallel rays along z
     empty = np.ones((three.positions.shape[1], 1, 1000, 1000), np.uint8)
     for t in range(len(empty)):
         for x, y in np.rint(100.0 * three.positions[three.body == 0, t, :2] + 500).astype(int):
             empty[t, 0, y - 3 : y + 4, x - 3 : x + 4] = 0
-    outlines = Outlines(np.arange(len(empty)), P, empty)
+    return Outlines(np.arange(len(empty)), P, empty)
+
+
+def test_a_body_that_leaves_the_silhouettes_is_not_chosen(three, alone, bodies, seen_from_above):
+    first = int(bodies.label[three.body == 0][0])
     motions = bodies.rotations.swapaxes(0, 1), bodies.translations.swapaxes(0, 1)
-    outside = [ray_depths._place(alone, r[None], t[None], outlines)[1].outside for r, t in zip(*motions, strict=True)]
+    outside = [
+        ray_depths._place(alone, r[None], t[None], seen_from_above)[1].outside for r, t in zip(*motions, strict=True)
+    ]
     own = three.body == 0
     missed = [float(np.median(o[own])) for o in outside]
     assert missed[first] < 0.05 < max(missed), missed
     assert np.argmin(missed) == first
+
+
+def test_samples_near_a_body_are_placed_as_all_are_and_those_far_from_it_are_left_out(
+    three, alone, bodies, seen_from_above
+):
+    last = int(bodies.label[three.body == 2][0])
+    motion = bodies.rotations[None, :, last], bodies.translations[None, :, last]
+    places = cKDTree(bodies.rest[bodies.label == last])
+    asked = np.arange(alone.count) % 2 == 0
+    some, near = ray_depths._place(alone, *motion, seen_from_above, asked, places)
+    _, every = ray_depths._place(alone, *motion, seen_from_above)
+    assert asked[some].all() and 0 < len(some) < asked.sum()
+    for part in ("rest", "miss", "depth", "outside"):
+        assert_array_equal(getattr(near, part), getattr(every, part)[some])
+    left_out = np.setdiff1d(np.flatnonzero(asked), some)
+    assert (places.query(every.rest[left_out])[0] > ray_depths._LOCAL * alone.diagonal).all()
 
 
 def test_lines_of_sight_that_come_near_a_body_at_some_depth_are_kept_and_far_ones_are_not():

@@ -52,3 +52,11 @@ def test_who_began_a_film_is_told_how_far_it_is(made: Made, tmp_path: Path, monk
         assert film() == path
     assert told[-1] == (here, ("video", 3, 3))
     assert {thread for thread, _ in told} == {here}
+
+
+@pytest.mark.parametrize(
+    ("frames", "fps", "step"),
+    [(60, 30.0, 1), (60, 29.97, 1), (60, 59.94, 2), (60, 50.0, 2), (60, 120.0, 4), (60, 5.0, 1), (101, 30.0, 2)],
+)
+def test_films_are_smooth_and_short(frames: int, fps: float, step: int) -> None:
+    assert films.thinning(frames, fps, at_most=100) == step
