@@ -60,7 +60,9 @@ class ImageMotion:
     pattern : BlockPattern
     point_spacing : float
         Distance of neighbouring points of a frame.
-    stiffness, give, strain_cost : float
+    stiffness : (E,) float
+        Of each edge.
+    give, strain_cost : float
         See `NodeTrackingSettings`.
     point_weight : float
         Pull along the surface relative to that across it.
@@ -69,7 +71,7 @@ class ImageMotion:
     graph: NodeGraph
     pattern: BlockPattern
     point_spacing: float
-    stiffness: float
+    stiffness: np.ndarray
     give: float
     strain_cost: float
     point_weight: float

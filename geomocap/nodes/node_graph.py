@@ -73,6 +73,16 @@ class NodeGraph:
         strains(x, R, self.nodes, self.edges, self.lengths, found)
         return found
 
+    def mean_of_edges(self, values: np.ndarray) -> np.ndarray:
+        """Mean of the values (E,) of each node's edges, (N,); 0 without any."""
+        N = len(self.nodes)
+        ends = self.edges.ravel()
+        return np.bincount(ends, np.repeat(values, 2), N) / np.maximum(np.bincount(ends, minlength=N), 1)
+
+    def departure(self, x: np.ndarray, R: np.ndarray) -> np.ndarray:
+        """Distance of each node from where its neighbours would rigidly have it, root mean square, (N,), metres."""
+        return np.sqrt(self.mean_of_edges((self.strain(x, R) * self.lengths) ** 2))
+
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def deform(x, R, binding, weights, offsets, normals, places, turned):

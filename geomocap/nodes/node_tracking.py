@@ -16,13 +16,14 @@ from geomocap.nodes.anchors import AnchorPoints, Anchors
 from geomocap.nodes.coarse_motion import CoarseModel, CoarseTarget, State, follow, mend
 from geomocap.nodes.correspondences import Target, pull
 from geomocap.nodes.deformation import block_pattern, step
+from geomocap.nodes.edge_stiffness import learned_stiffness
 from geomocap.nodes.extremities import extremities
 from geomocap.nodes.image_motion import ImageMotion, NodeState
 from geomocap.nodes.image_pull import FrameImages, Views
 from geomocap.nodes.keyframes import most_open, openness
 from geomocap.nodes.node_graph import farthest_points, largest_parts, node_graph
 from geomocap.nodes.node_settings import NodeTrackingSettings
-from geomocap.nodes.node_uncertainty import node_covariance, patch_mean
+from geomocap.nodes.node_uncertainty import carried_sigma, node_covariance, patch_mean, with_departure
 from geomocap.nodes.rigid_parts import find_rigid_parts
 from geomocap.nodes.surface_points import PointSet, point_set, surface_graph
 from geomocap.progress import Progress, silent
@@ -59,6 +60,10 @@ class NodeTracks:
         Positions in the reference frame, complete.
     edges : (E, 2) int
         Neighbours on the surface.
+    departure : (N, T) float, metres
+        Distance of each node from where its neighbours would have it: large where it, or they, went astray.
+    spacing : float, metres
+        Mean distance of neighbours.
     parts : (N,) int, optional
         Rigid part of each node, if they were followed as parts.
     """
@@ -69,6 +74,8 @@ class NodeTracks:
     reference_frame: int
     reference: np.ndarray
     edges: np.ndarray
+    departure: np.ndarray
+    spacing: float
     parts: np.ndarray | None = None
 
     @property
@@ -76,16 +83,24 @@ class NodeTracks:
         """Standard deviation of a coordinate, root mean square of the three directions, (N, T) float, metres."""
         return np.sqrt(np.trace(self.covariance, axis1=2, axis2=3) / 3)
 
-    def motion_paths(self) -> MotionPaths:
+    def motion_paths(self, anchors: MotionPaths | None = None) -> MotionPaths:
         """Return the nodes as motion paths, those that are never seen left out.
 
         Without their rotations: how a node's neighbours turn about it is steadier than how it turns itself. Motion is
         counted from frame 0: from the reference frame, which is one in the middle, what turns on and on would turn by
         half as much.
+
+        Parameters
+        ----------
+        anchors : MotionPaths, optional
+            What held the nodes in the images; with `sigma`. The nodes are then as precise as these carry them.
         """
         seen = np.isfinite(self.positions[..., 0]).any(axis=1)
         parts = None if self.parts is None else np.unique(self.parts[seen], return_inverse=True)[1]
-        return MotionPaths(self.positions[seen], sigma=self.sigma[seen], parts=parts)
+        positions, sigma = self.positions[seen], self.sigma[seen]
+        if anchors is not None:
+            sigma = with_departure(carried_sigma(positions, anchors), self.departure[seen], self.spacing)
+        return MotionPaths(positions, sigma=sigma, parts=parts)
 
 
 @dataclass(frozen=True)
@@ -185,12 +200,16 @@ class NodeModel:
         )
         return covariance, support < s.lost_below
 
-    def image_motion(self) -> ImageMotion:
-        """Return what follows the fine graph in images too."""
+    def held_in_images(self, target: Target, x: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `held`; nodes farther than a spacing from where their neighbours have them are lost too."""
+        covariance, lost = self.held(target, x, R)
+        return covariance, lost | (self.graph.departure(x, R) > self.graph.spacing)
+
+    def image_motion(self, geometric: list[NodeState]) -> ImageMotion:
+        """Return what follows the fine graph in images too, as firm as the geometry alone has shown it to be."""
         s = self.settings
-        return ImageMotion(
-            self.graph, self.pattern, self.spacing, s.image_stiffness, s.give, s.strain_cost, s.point_weight
-        )
+        stiffness = s.image_stiffness * learned_stiffness(self.graph, geometric)
+        return ImageMotion(self.graph, self.pattern, self.spacing, stiffness, s.give, s.strain_cost, s.point_weight)
 
 
 def track_nodes(
@@ -303,8 +322,12 @@ def _tracks(model: NodeModel, frames: list[NodeFit], reference: int, unit: Unit)
     """Put the nodes' positions, rotations, covariances, and which are lost, of all frames together, in metres."""
     x, R, covariance, lost = (np.stack([f[k] for f in frames], axis=1) for k in range(4))
     x[lost] = np.nan
-    places = unit.back(model.graph.nodes)
-    return NodeTracks(unit.back(x), R, unit.length**2 * covariance, reference, places, model.graph.edges)
+    g = model.graph
+    departure = unit.length * np.stack([g.departure(f[0], f[1]) for f in frames], axis=1)
+    spacing = unit.length * g.spacing
+    places = unit.back(g.nodes)
+    covariance = unit.length**2 * covariance
+    return NodeTracks(unit.back(x), R, covariance, reference, places, g.edges, departure, spacing)
 
 
 def _measured(anchors: MotionPaths | None, known: Anchors, unit: Unit) -> Anchors:
@@ -329,8 +352,9 @@ def _followed_in_images(
     """Follow the fine graph in points and images; positions, rotations, covariances, which are lost, of each frame."""
     settings = model.settings
     targets = [Target(f, np.full(f.features.shape[1], settings.feature_scale), settings.normal_weight) for f in frames]
+    motion = model.image_motion(geometric)
     ahead, back = map_items(
-        lambda way: model.image_motion().follow(
+        lambda way: motion.follow(
             targets,
             lambda k: FrameImages.of(images(k), unit.length, unit.origin),
             geometric,
@@ -344,4 +368,4 @@ def _followed_in_images(
         progress,
     )
     states = back[:0:-1] + ahead
-    return [(x, R, *model.held(t, x, R)) for t, (x, R) in zip(targets, states, strict=True)]
+    return [(x, R, *model.held_in_images(t, x, R)) for t, (x, R) in zip(targets, states, strict=True)]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from geomocap.errors import GeometryError
@@ -16,7 +14,6 @@ from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.trajectories import Trajectories
 from geomocap.motion import SAMPLES, evenly_over_surface
 from geomocap.nodes.node_tracking import track_nodes
-from geomocap.nodes.node_uncertainty import carried_sigma
 from geomocap.nodes.surface_coverage import SMALLEST_PIECE, even_spacing, left_over, piece_reach, uncovered_fraction
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.track_stage import frame_reader
@@ -76,9 +73,7 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
         if uncovered_fraction(geometry.points, patches.positions, piece_reach(_first_surface(geometry))) < enough:
             return {"patches": patches}
     anchors = None if tracked is None else _anchors(tracked, spacing)
-    nodes = _follow_nodes(job, geometry, anchors)
-    # images hold nodes, which the geometry doesn't know
-    held = nodes if anchors is None else replace(nodes, sigma=carried_sigma(nodes.positions, anchors))
+    held = _follow_nodes(job, geometry, anchors)
     if patches is None:
         return {"nodes" if tracked is None else "both": held}
     if patches.ray is not None:
@@ -99,7 +94,7 @@ def _follow_nodes(job: Job, geometry: Geometry, anchors: MotionPaths | None) -> 
     nodes = track_nodes(
         geometry.points, len(geometry), following, features, job.progress, job.executor, anchors, images
     )
-    return nodes.motion_paths()
+    return nodes.motion_paths(anchors)  # images hold nodes, which the geometry doesn't know
 
 
 def point_paths(job: Job, geometry: Geometry) -> MotionPaths | None:

@@ -230,7 +230,7 @@ def test_a_lost_limb_is_found_again_and_followed_back():
     geometric = [(truth[k] if k >= REGAINED else at_rest, still) for k in range(len(frames))]
     targets = [Target(frame, np.zeros(0)) for frame in frames]
 
-    states = model.image_motion().follow(targets, even, geometric, 0, 1, Anchors.none(len(frames)))
+    states = model.image_motion(geometric).follow(targets, even, geometric, 0, 1, Anchors.none(len(frames)))
 
     limb = at_rest[:, 0] > 0.65
     far = [float(np.median(np.linalg.norm(x - y, axis=1)[limb])) for (x, _), y in zip(states, truth, strict=True)]

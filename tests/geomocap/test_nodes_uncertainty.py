@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from geomocap.model.motion_paths import MotionPaths
-from geomocap.nodes.node_uncertainty import carried_sigma
+from geomocap.nodes.node_uncertainty import carried_sigma, with_departure
 
 FRAMES = 3
 
@@ -46,3 +46,14 @@ def test_precision_of_each_frame_counts():
     nodes = np.zeros((1, FRAMES, 3))
     sigma = np.array([[0.001, 0.002, 0.004]])
     np.testing.assert_allclose(carried_sigma(nodes, MotionPaths(np.zeros((1, FRAMES, 3)), sigma=sigma)), sigma)
+
+
+def test_nodes_that_went_astray_are_less_sure():
+    sigma = np.full((2, FRAMES), 0.003)
+    departure = np.zeros((2, FRAMES))
+    departure[1, 2] = 0.1
+    found = with_departure(sigma, departure, 0.02)
+    np.testing.assert_allclose(found[0], found[0, 0])
+    np.testing.assert_allclose(found[1, :2], found[0, 0])
+    assert 0.02 < found[1, 2] < 0.1
+    assert found[0, 0] > sigma[0, 0]  # no node is as precise as a patch
