@@ -15,8 +15,8 @@ from geomocap.nodes.node_graph import NodeGraph
 _LEAST_STRAIN = 1e-4  # fraction of an edge's length
 # Bounds of an edge's weight, relative to the usual one. Means over bones of the nodes' distance, 100 mm at most, from
 # where their own bone has them, with all edges alike → with these bounds: galloping stag 17.6 → 16.5 mm, walking horse
-# 12.2 → 10.9, bird 17.1 → 15.8, walking dwarf 47.4 → 47.7 (his legs are lost). Three times the weights: 19.1, 11.4,
-# 13.8, 46.3; all edges three times as firm: 20.5, 12.8, 14.7, 46.5.
+# 12.2 → 10.9, bird 17.1 → 15.8, walking dwarf 47.4 → 47.7. Three times the weights: 19.1, 11.4, 13.8, 46.3; all edges
+# three times as firm: 20.5, 12.8, 14.7, 46.5.
 _BOUNDS = (0.3, 10.0)
 
 State = tuple[np.ndarray, np.ndarray]

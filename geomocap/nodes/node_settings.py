@@ -22,7 +22,7 @@ class NodeTrackingSettings(Settings):
     )
     fine_stiffness: float = Field(1.5, gt=0, description="the same for the fine graph")
     image_stiffness: float = Field(
-        1.0, gt=0, description="the same for the fine graph where images guide it (0.7 to 2 measure alike)"
+        1.0, gt=0, description="the same for the usual edge of the fine graph where images guide it"
     )
     normal_weight: float = Field(1.0, ge=0, description="weight of normals against positions when points are matched")
     give: float = Field(0.3, gt=0, description="strain at which an edge gives way (fraction of its length)")
