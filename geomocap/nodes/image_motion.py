@@ -18,7 +18,7 @@ from geomocap.model.rotations import nearest_rotation
 from geomocap.nodes.anchors import AnchorPoints, Anchors, find_homes
 from geomocap.nodes.correspondences import Target, pull
 from geomocap.nodes.deformation import BlockPattern, step
-from geomocap.nodes.image_pull import HALF, LEAST_COSINE, FrameImages, add_pulls, window_pulls, window_values
+from geomocap.nodes.image_pull import HALF, LEAST_COSINE, FrameImages, window_pulls
 from geomocap.nodes.node_graph import NodeGraph
 from geomocap.nodes.surface_coverage import limbs_apart
 
@@ -48,27 +48,6 @@ class _Earlier:
     places: np.ndarray
     axes: np.ndarray
     cosine: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Windows:
-    """What K earlier frames show in the windows of all samples.
-
-    Attributes
-    ----------
-    level : int
-        Of the images.
-    step : (S, C) float
-        Distance of a window's pixels on the surface.
-    values : (K, S, C, pixels) float32
-    seen : (K, S, C) bool
-        Which the cameras saw.
-    """
-
-    level: int
-    step: np.ndarray
-    values: np.ndarray
-    seen: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -148,11 +127,9 @@ class ImageMotion:
                 starts.append(_with_limbs(starts[0], geometric[t], elsewhere))
             marks = marks_of(t)
             starts = [marks.move(g, *start, self.give, self._scale()) for start in starts]
-            windows = self._windows(images, earlier, starts[0], 0)
-            found = [self._fit(frames[t], images, windows, marks, start) for start in starts]
+            found = [self._fit(frames[t], images, earlier, marks, start, 0) for start in starts]
             best = found[self._better(frames[t], found)][0]
-            windows = self._windows(images, earlier, best, 1)
-            states.append(self._fit(frames[t], images, windows, marks, best)[0])
+            states.append(self._fit(frames[t], images, earlier, marks, best, 1)[0])
             new = np.isnan(homes[:, 0])
             homes[new] = find_homes(g, *states[-1], known, t)[new]
             if self._apart(states[-1], starts[0]).any():
@@ -189,8 +166,7 @@ class ImageMotion:
             found = []
             for state, of in levels:
                 for level in of:
-                    windows = self._windows(images, earlier, state, level)
-                    state, errors = self._fit(frames[k], images, windows, marks(k), state)
+                    state, errors = self._fit(frames[k], images, earlier, marks(k), state, level)
                 found.append((state, errors))
             if self._better(frames[k], found) == 0:
                 return
@@ -247,36 +223,27 @@ class ImageMotion:
         self,
         frame: Target,
         images: FrameImages,
-        windows: _Windows,
+        earlier: list[_Earlier],
         marks: AnchorPoints,
         start: NodeState,
+        level: int,
     ) -> tuple[NodeState, np.ndarray]:
-        """Fit on the images of a level; the state, and the mean squared difference of each window, NaN: not seen."""
+        """Fit on images of a level; the state, and the mean squared difference of each window, NaN where not seen."""
         x, R = start
         g, c = self.graph, self._scale()
         frame = replace(frame, points=frame.points.turned_like(*g.deform(x, R), 0.5 * g.spacing))
         fraction = len(g.samples) / len(g.nodes) / 4
         errors = np.zeros((0,))
-        for _ in range(_STEPS[windows.level]):
+        for _ in range(_STEPS[level]):
             y, normals = g.deform(x, R)
             found = pull(frame, y, normals, g.features, c, self.point_weight, 0.0)
             A, b = _CORRELATED * found.A, _CORRELATED * found.b
             noise = max(_NORMAL * float(np.median(np.abs(found.across))), 0.3 * self.point_spacing)
-            errors = self._add_images(A, b, noise, images, windows, y, normals, self._axes(R))
+            errors = self._add_images(A, b, noise, images, earlier, y, normals, self._axes(R), level)
             marks.add_to(A, b, g, x, R, noise**2, c)
             soft = np.maximum(1 / (1 + (g.strain(x, R) / self.give) ** 2) ** 2, _TORN)
             x, R = step(g, self.pattern, x, R, self.stiffness * fraction * soft, A, b, 60)
         return (x, R), errors
-
-    def _windows(self, images: FrameImages, earlier: list[_Earlier], state: NodeState, level: int) -> _Windows:
-        """Look earlier frames up once for all steps from about a state on; pixels are as far apart as there."""
-        step = _SPREAD[level] * images.look(*self.graph.deform(*state))[1]
-        values = np.empty((len(earlier), *step.shape, (2 * HALF + 1) ** 2), np.float32)
-        seen = np.stack([then.cosine > 0 for then in earlier])
-        for k, then in enumerate(earlier):
-            shown = then.images.levels[level], then.images.projections, then.images.masks
-            window_values(*shown, then.places, then.axes, step, seen[k], HALF, values[k])
-        return _Windows(level, step, values, seen)
 
     def _add_images(
         self,
@@ -284,47 +251,59 @@ class ImageMotion:
         b: np.ndarray,
         noise: float,
         images: FrameImages,
-        windows: _Windows,
+        earlier: list[_Earlier],
         y: np.ndarray,
         normals: np.ndarray,
         axes: np.ndarray,
+        level: int,
     ) -> np.ndarray:
-        """Add what images pull to A (S, 3, 3) and b (S, 3), in place; the windows' mean squared differences (K, S, C).
+        """Add what images pull to A (S, 3, 3) and b (S, 3), in place; the windows' mean squared differences (E, S, C).
 
         Points pull with weight 1 at their standard deviation `noise`; images' weights are put into that unit. Pixels
         that the windows of several samples hold count once.
         """
-        cosine = images.look(y, normals)[0]
-        shape = windows.seen.shape
-        own = 0.9 * self.graph.spacing**2 * len(self.graph.nodes) / len(y)
-        once = own / ((2 * HALF + 1) * windows.step) ** 2 * np.maximum(cosine, LEAST_COSINE)
-        more, pulled = np.empty((*shape, 3, 3)), np.empty((*shape, 3))
-        total, pixels = np.empty(shape), np.empty(shape, np.int64)
+        S, C = len(y), len(images.projections)
+        cosine, pixel = images.look(y, normals)
+        spread = _SPREAD[level] * pixel
+        own = 0.9 * self.graph.spacing**2 * len(self.graph.nodes) / S
+        once = np.minimum(own / ((2 * HALF + 1) * spread) ** 2 * np.maximum(cosine, LEAST_COSINE), 1.0)
+        # always as many earlier frames, so that the kernel is one: the last is repeated, and not looked at
+        count = len(earlier)
+        padded = earlier + [earlier[-1]] * (len(EARLIER) + 1 - count)
+        seen = np.stack([(cosine > 0) & (then.cosine > 0) & (k < count) for k, then in enumerate(padded)])
+        more, pulled = np.zeros((len(padded), S, C, 3, 3)), np.zeros((len(padded), S, C, 3))
+        total, pixels = np.zeros((len(padded), S, C)), np.zeros((len(padded), S, C), np.int64)
         window_pulls(
-            images.levels[windows.level],
+            images.levels[level],
             images.projections,
             images.masks,
-            windows.values,
+            tuple(then.images.levels[level] for then in padded),
+            tuple(then.images.projections for then in padded),
+            tuple(then.images.masks for then in padded),
             y,
             axes,
-            windows.step,
-            windows.seen & (cosine > 0),
+            np.stack([then.places for then in padded]),
+            np.stack([then.axes for then in padded]),
+            spread,
+            seen,
             HALF,
             more,
             pulled,
             total,
             pixels,
         )
-        mean = np.where(pixels > 0, total / np.maximum(pixels, 1), np.nan)
-        weight = np.zeros(shape)
-        for k in range(shape[0]):
+        errors = np.full((count, S, C), np.nan)
+        for k in range(count):
             known = pixels[k] > 0
-            if known.any():
-                usual = max(float(np.median(mean[k, known])), _LEAST)
-                alike = 1 / (1 + mean[k, known] / (_DEPARTED * usual)) ** 2
-                weight[k, known] = np.minimum(once[known], 1.0) * alike * noise**2 / usual
-        add_pulls(A, b, more, pulled, weight)
-        return mean
+            if not known.any():
+                continue
+            mean = total[k] / np.maximum(pixels[k], 1)
+            usual = max(float(np.median(mean[known])), _LEAST)
+            weight = np.where(known, once / (1 + mean / (_DEPARTED * usual)) ** 2, 0.0) * noise**2 / usual
+            A += (weight[:, None] @ more[k].reshape(S, C, 9)).reshape(S, 3, 3)
+            b += (weight[:, None] @ pulled[k])[:, 0]
+            errors[k][known] = mean[known]
+        return errors
 
 
 def _continued(before: NodeState, last: NodeState) -> NodeState:

@@ -151,64 +151,28 @@ def _project_window(P, y, e, step, middle, row, column):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def window_values(image, P, mask, y, e, step, seen, half, values):
-    """Look a frame's images up in the windows of all samples.
-
-    Parameters
-    ----------
-    image, mask : (C, h, w) float32, uint8
-    P : (C, 3, 4) float
-    y, e : (S, 3), (S, 2, 3) float
-        Samples of the frame's surface and two axes of their tangent planes.
-    step : (S, C) float
-        Distance of a window's pixels on the surface.
-    seen : (S, C) bool
-        Which windows to look up.
-    half : int
-    values : (S, C, (2 half + 1)²) float32, out
-        NaN where the window isn't on the silhouette, or is not to be looked up.
-    """
-    side = 2 * half + 1
-    o, di, dj = np.empty(3), np.empty(3), np.empty(3)
-    high, wide = mask.shape[1:]
-    for s in range(len(y)):
-        for c in range(len(P)):
-            values[s, c] = np.nan
-            if not seen[s, c]:
-                continue
-            _project_window(P[c], y[s], e[s], step[s, c], o, di, dj)
-            for n in range(side**2):
-                i, j = n // side - half, n % side - half
-                w = o[2] + i * di[2] + j * dj[2]
-                if w <= 0:
-                    continue
-                w = 1.0 / w
-                u, v = w * (o[0] + i * di[0] + j * dj[0]), w * (o[1] + i * di[1] + j * dj[1])
-                if u >= 0 and v >= 0 and u < wide - 1 and v < high - 1 and mask[c, int(v + 0.5), int(u + 0.5)] != 0:
-                    values[s, c, n] = _value(image[c], u, v)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def window_pulls(now, P, mask, before, y, e, step, seen, half, A, b, error, count):
+def window_pulls(now, P, mask_now, then, Q, mask_then, y, e, y0, e0, step, seen, half, A, b, error, count):
     """Gather what the windows of all samples in all cameras ask against K earlier frames, with σ = 1.
 
     Parameters
     ----------
-    now, mask : (C, h, w) float32, uint8
+    now, mask_now : (C, h, w) float32, uint8
         Images and silhouettes of this frame.
     P : (C, 3, 4) float
         Its projections.
-    before : (K, S, C, (2 half + 1)²) float32
-        What earlier frames show there, from `window_values`.
+    then, Q, mask_then : tuple of K
+        The same of earlier frames, whose images may have other sizes.
     y, e : (S, 3), (S, 2, 3) float
         Samples of this frame's surface and two axes of their tangent planes.
+    y0, e0 : (K, S, 3), (K, S, 2, 3) float
+        The same of the earlier frames.
     step : (S, C) float
         Distance of a window's pixels on the surface.
     seen : (K, S, C) bool
         Which windows to compare.
     half : int
     A, b : (K, S, C, 3, 3), (K, S, C, 3) float, out
-        Weights of the samples' places, and these times their errors; where windows were compared.
+        Weights of the samples' places, and these times their errors.
     error : (K, S, C) float, out
         Sum of the squared differences.
     count : (K, S, C) int, out
@@ -216,7 +180,6 @@ def window_pulls(now, P, mask, before, y, e, step, seen, half, A, b, error, coun
     """
     side = 2 * half + 1
     size = side**2
-    K = len(before)
     value, slope, on = np.empty(size), np.empty((size, 3)), np.empty(size, np.bool_)
     across = np.empty((size, 2))
     for n in range(size):
@@ -225,12 +188,12 @@ def window_pulls(now, P, mask, before, y, e, step, seen, half, A, b, error, coun
     o, di, dj = np.empty(3), np.empty(3), np.empty(3)
     # sums of slopes and of their products over the window's pixels, and over those that an earlier frame hasn't
     some, products, less, products_less, pulled = np.empty(3), np.empty(6), np.empty(3), np.empty(6), np.empty(3)
-    height, width = mask.shape[1:]
+    height, width = mask_now.shape[1:]
     for s in range(len(y)):
         for c in range(len(P)):
             wanted = False
-            for k in range(K):
-                count[k, s, c], error[k, s, c] = 0, 0.0
+            for k in range(len(then)):
+                count[k, s, c] = 0
                 wanted |= seen[k, s, c]
             if not wanted:
                 continue
@@ -249,7 +212,7 @@ def window_pulls(now, P, mask, before, y, e, step, seen, half, A, b, error, coun
                 u, v = w * (o[0] + i * di[0] + j * dj[0]), w * (o[1] + i * di[1] + j * dj[1])
                 if not (u >= 1 and v >= 1 and u < width - 2 and v < height - 2):
                     continue
-                if mask[c, int(v + 0.5), int(u + 0.5)] == 0:
+                if mask_now[c, int(v + 0.5), int(u + 0.5)] == 0:
                     continue
                 on[n] = True
                 there += 1
@@ -270,18 +233,26 @@ def window_pulls(now, P, mask, before, y, e, step, seen, half, A, b, error, coun
                 _count_slope(slope[n], some, products)
             if there < _LEAST_FILLED * size:
                 continue
-            for k in range(K):
+            for k in range(len(then)):
                 if not seen[k, s, c]:
                     continue
+                _project_window(Q[k][c], y0[k, s], e0[k, s], step[s, c], o, di, dj)
+                before, mask = then[k][c], mask_then[k][c]
+                high, wide = mask.shape
                 found, total, squares = 0, 0.0, 0.0
                 less[:], products_less[:], pulled[:] = 0.0, 0.0, 0.0
                 for n in range(size):
                     if not on[n]:
                         continue
-                    r = value[n] - before[k, s, c, n]
-                    if r != r:  # not on the silhouette then
+                    i, j = across[n, 0], across[n, 1]
+                    w = o[2] + i * di[2] + j * dj[2]
+                    w = 1.0 / w if w > 0 else -1.0
+                    u, v = w * (o[0] + i * di[0] + j * dj[0]), w * (o[1] + i * di[1] + j * dj[1])
+                    inside = w > 0 and u >= 0 and v >= 0 and u < wide - 1 and v < high - 1
+                    if not inside or mask[int(v + 0.5), int(u + 0.5)] == 0:
                         _count_slope(slope[n], less, products_less)
                         continue
+                    r = value[n] - _value(before, u, v)
                     found += 1
                     total += r
                     squares += r * r
@@ -299,22 +270,6 @@ def window_pulls(now, P, mask, before, y, e, step, seen, half, A, b, error, coun
                         A[k, s, c, m, n] = products[at] - products_less[at] - mean * (some[n] - less[n])
                         A[k, s, c, n, m] = A[k, s, c, m, n]
                         at += 1
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def add_pulls(A, b, more, pulled, weight):
-    """Add what windows ask for, (K, S, C, 3, 3) and (K, S, C, 3), by weight (K, S, C) to A (S, 3, 3) and b (S, 3)."""
-    K, S, C = weight.shape
-    for k in range(K):
-        for s in range(S):
-            for c in range(C):
-                w = weight[k, s, c]
-                if w == 0:
-                    continue
-                for m in range(3):
-                    b[s, m] += w * pulled[k, s, c, m]
-                    for n in range(3):
-                        A[s, m, n] += w * more[k, s, c, m, n]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
