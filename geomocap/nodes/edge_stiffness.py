@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from geomocap.nodes.image_motion import NodeState
 from geomocap.nodes.node_graph import NodeGraph
 
 _LEAST_STRAIN = 1e-4  # fraction of an edge's length
@@ -19,11 +20,8 @@ _LEAST_STRAIN = 1e-4  # fraction of an edge's length
 # three times as firm: 20.5, 12.8, 14.7, 46.5.
 _BOUNDS = (0.3, 10.0)
 
-State = tuple[np.ndarray, np.ndarray]
-"""Places (N, 3) and rotations (N, 3, 3) of the nodes in a frame."""
 
-
-def learned_stiffness(graph: NodeGraph, states: Sequence[State]) -> np.ndarray:
+def learned_stiffness(graph: NodeGraph, states: Sequence[NodeState]) -> np.ndarray:
     """Weights of the edges relative to the usual one, (E,): 1 where they strain as most do, more where less.
 
     The strain of an edge is its median over the frames, averaged over the edges around it.
@@ -31,7 +29,7 @@ def learned_stiffness(graph: NodeGraph, states: Sequence[State]) -> np.ndarray:
     Parameters
     ----------
     graph : NodeGraph
-    states : sequence of (N, 3), (N, 3, 3)
+    states : sequence of NodeState
         The nodes in each frame, in a motion with all edges alike.
     """
     strain = np.median([graph.strain(x, R) for x, R in states], axis=0)

@@ -11,11 +11,12 @@ from geomocap.nodes.node_graph import NodeGraph
 
 # Standard deviation of a coordinate, fraction of the distance from the nearest anchor.
 _SWAY = 0.05
-# The same, fraction of the distance from where the neighbours would have a node; and the least, node spacings. Of nodes
-# of a galloping stag, a galloping and a trotting horse, by the likelihood of their distances from where their bone has
-# them (at most five standard deviations), of 0 to 1 (sway), 0 to 1 and 0 to 0.1. Logarithms, in each frame: 0.1 of
-# sway alone 12.4, 11.9 and 11.5, these 12.9, 12.3 and 12.1; a spinning dwarf 9.1, 9.2. Nodes that are 60 mm and more
-# astray have a larger one than others with probability 0.76 to 0.89; by the distance from the anchor alone 0.6.
+# The same, fraction of the distance from where the neighbours would have a node; and the least, node spacings. All
+# three were chosen by the likelihood of the nodes' distances from where their bone has them, at most five standard
+# deviations, on a galloping stag and a trotting and a galloping horse. Its logarithm, in each frame, with 0.1 of the
+# distance from the anchor alone → these (and firmer edges): stag 12.4 → 13.0, trotting horse 11.5 → 12.3. Nodes that
+# are 60 mm and more astray have a larger one than others with probability 0.62 → 0.89 and 0.60 → 0.84. A fan in small
+# images comes in a body too many as often (3 and 4 of 18: three captures, six choices of the paths).
 _STRAYED = 0.3
 _LEAST = 0.05
 

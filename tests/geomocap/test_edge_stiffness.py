@@ -45,7 +45,7 @@ def test_one_frame_astray_teaches_nothing():
     astray = states[3][0].copy()
     astray[::3] += 5.0
     states.append((astray, states[3][1]))
-    assert np.abs(np.log(learned_stiffness(graph, states) / firm)).max() < np.log(3)
+    assert np.abs(np.log(learned_stiffness(graph, states) / firm)).max() < np.log(3)  # weights may differ 33-fold
 
 
 def test_a_node_departs_by_as_much_as_its_neighbours_say():
