@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
 
 from geomocap.bodies.body_evidence import TURN_FRACTION
 from geomocap.bodies.motion_bodies import MotionBodies, MotionBodiesSettings
-from geomocap.bodies.point_labels import label_points
+from geomocap.bodies.point_labels import Voters, label_points
 from geomocap.bodies.ray_depths import find_bodies_and_depths
 from geomocap.bodies.rigid_motions import relative_turn
+from geomocap.bodies.track_labels import label_tracks
 from geomocap.errors import GeometryError
-from geomocap.model.even_choice import evenly_chosen
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.outlines import Outlines
 from geomocap.model.skeleton import Skeleton
@@ -38,7 +38,6 @@ _UNSURE_DEG = 30.0  # 3 to 8 with eight cameras; with four that show the bodies 
 # passed as bodies turned by 1° then. With all of it true pieces of trunks went, which came out 1° below: of a horse's
 # paths with 3 mm of noise the core index fell from 0.99 to 0.79. Nothing between was tried.
 _ALIKE = 0.5
-_LABEL_FRAMES = 12  # frames in which tracks that were not sampled are compared with those that were
 
 
 class MotionSettings(Settings):
@@ -64,12 +63,15 @@ class Motion:
         What the samples did.
     labels : (N,) int32
         Body of each track that was given; -1: none. Of scans, of each sample.
+    voters : Voters
+        Followed points whose bodies are known; they label others.
     """
 
     bodies: MotionBodies
     connected: MotionSkeleton
     paths: MotionPaths
     labels: np.ndarray
+    voters: Voters
 
     @property
     def body_count(self) -> int:
@@ -103,7 +105,17 @@ class Motion:
 
     def label(self, frame: int, points: np.ndarray) -> np.ndarray:
         """Bodies (M,) int32 of any points (M, 3), metres, of the surface in a frame."""
-        return label_points(self.bodies, self.paths, frame, points)
+        return label_points(self.voters, frame, points)
+
+    def with_tracks(self, tracks: np.ndarray) -> Motion:
+        """Let further tracks (N, T, 3), metres, NaN where unseen, help to label points: `labels` are theirs then.
+
+        Each gets the body that is near it and moves as it does. Bodies, joints and motion stay.
+        """
+        tracks = np.where(np.isfinite(tracks).all(axis=2, keepdims=True), tracks, np.nan)
+        labels, rest = label_tracks(self.bodies, Voters.of(self.bodies, self.paths), tracks)
+        voters = Voters.with_tracks(self.bodies, self.paths, tracks, labels, rest)
+        return replace(self, labels=labels, voters=voters)
 
 
 def unsure_turns(bodies: MotionBodies) -> tuple[str, ...]:
@@ -182,8 +194,12 @@ def find_motion(
     progress("skeleton", 0, 1)
     connected, found = _connect(found, paths, fps, settings)
     progress("skeleton", 1, 1)
-    labels = found.label if given is None else _labels_of_all(given, samples, found, paths)
-    return Motion(found, connected, paths, labels)
+    motion = Motion(found, connected, paths, found.label, Voters.of(found, paths))
+    if given is None:
+        return motion
+    motion = motion.with_tracks(given)
+    motion.labels[samples] = found.label
+    return motion
 
 
 def _connect(
@@ -243,16 +259,3 @@ def _followed(
     points = [scan[np.isfinite(scan).all(axis=1)] for scan in points]
     nodes = track_nodes(points.__getitem__, len(points), settings, progress=progress, executor=executor)
     return nodes.motion_paths()
-
-
-def _labels_of_all(tracks: np.ndarray, samples: np.ndarray, bodies: MotionBodies, paths: MotionPaths) -> np.ndarray:
-    """Bodies of all tracks, (N,) int32: of a sample its own, of another one by where it lies in some frame."""
-    labels = np.full(len(tracks), -1, np.int32)
-    seen = np.isfinite(tracks).all(axis=2)
-    frames = evenly_chosen(tracks.shape[1], _LABEL_FRAMES)
-    for frame in (*frames, *np.setdiff1d(np.arange(tracks.shape[1]), frames)):
-        some = np.flatnonzero(seen[:, frame] & (labels < 0))
-        if len(some):
-            labels[some] = label_points(bodies, paths, int(frame), tracks[some, frame])
-    labels[samples] = bodies.label
-    return labels

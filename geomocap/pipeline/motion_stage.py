@@ -53,7 +53,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     `motion_paths` takes.
     """
     frames, config = len(geometry), job.config
-    choice = motion_paths(job, geometry, has_tracks)
+    choice, tracks = motion_paths(job, geometry, has_tracks)
     settings = MotionSettings(
         bodies=config.motion_bodies, skeleton=config.motion_skeleton, refinement=config.refinement, nodes=config.nodes
     )
@@ -63,6 +63,8 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
             source: find_motion(paths, fps=job.fps, settings=settings, progress=job.progress, outlines=outlines)
             for source, paths in choice.items()
         }
+        if tracks is not None:
+            found_from = {source: motion.with_tracks(tracks) for source, motion in found_from.items()}
         count["items"] = frames
     candidates = {source: _candidate(job, geometry, motion, len(choice) > 1) for source, motion in found_from.items()}
     source = min(candidates, key=lambda which: candidates[which].misfit)

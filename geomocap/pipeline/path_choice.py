@@ -27,13 +27,17 @@ ALONE_FRACTION = (
 # real recording) without patches; bodies from nodes explained silhouettes and paths worse there. Nothing between 0.2
 # and 1 was measured: half is where nodes would say more of the surface than patches do.
 LARGEST_BULK = 0.5
-ANCHOR_FRACTION = 0.1  # of the frames, in which trajectories that keep nodes from sliding are measured at least
+# Of the frames, in which trajectories that keep nodes from sliding, or say where bodies begin, are measured at least.
+SHORT_FRACTION = 0.1
 
 
-def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, MotionPaths]:
+def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> tuple[dict[str, MotionPaths], np.ndarray | None]:
     """Motion paths by what they are; where there is a choice, bodies tell which are best.
 
-    They are "patches", "nodes", "both" (nodes held by patches and images), "pieces" (patches, and those nodes where
+    Paths are evenly over the surface. All tracks that these were chosen from come along, as they show where one body
+    ends and another begins: (N, T, 3) metres, NaN where unseen.
+
+    Paths are "patches", "nodes", "both" (nodes held by patches and images), "pieces" (patches, and those nodes where
     these leave gaps), "points" or "ellipsoids". Nodes are followed only where patches leave a piece of the surface
     uncovered. Where single cameras follow the surface that is where these leave half of it; then "patches" and "both"
     are returned.
@@ -51,35 +55,43 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> dict[str, Mo
         If patches or points are asked for and there are none.
     """
     wanted = job.config.segmentation.paths
-    given = point_paths(job, geometry)
-    if given is not None:
-        return {"points": given}
+    points = _point_tracks(job, geometry)
+    if points is not None:
+        return {"points": MotionPaths(points[evenly_over_surface(points)])}, points
     if wanted == "ellipsoids":
         settings = job.config.segmentation
         found = ellipsoid_paths(geometry.points, len(geometry), geometry.spacing, settings, job.executor, job.progress)
-        return {wanted: MotionPaths(found.ellipsoids.centers.swapaxes(0, 1))}
+        return {wanted: MotionPaths(found.ellipsoids.centers.swapaxes(0, 1))}, None
     tracked = read_trajectories(job.run) if has_tracks else None
     spacing = path_spacing(geometry)
+    tracks = None if tracked is None else _tracks_of_several(tracked)
     patches = None if tracked is None or wanted == "both" else patch_paths(tracked, spacing)
     if wanted == "patches":
         if patches is None:
             raise GeometryError(
                 f"{job.run.path}: no surface patches could be followed in the images; set segmentation.paths = nodes"
             )
-        return {"patches": patches}
+        return {"patches": patches}, tracks
     if patches is not None:
         # what patches of single cameras leave uncovered is bulk of a hull of few cameras, and mostly no piece
         enough = SMALLEST_PIECE if patches.ray is None else LARGEST_BULK
         if uncovered_fraction(geometry.points, patches.positions, piece_reach(_first_surface(geometry))) < enough:
-            return {"patches": patches}
+            return {"patches": patches}, tracks
     anchors = None if tracked is None else _anchors(tracked, spacing)
     held = _follow_nodes(job, geometry, anchors)
     if patches is None:
-        return {"nodes" if tracked is None else "both": held}
+        return {"nodes" if tracked is None else "both": held}, tracks
     if patches.ray is not None:
-        return {"patches": patches, "both": held}
+        return {"patches": patches, "both": held}, tracks
     rest = np.flatnonzero(left_over(held.positions, patches.positions, spacing))
-    return {"pieces": _joined(patches, held, rest[spread_out(held.positions[rest], spacing)])}
+    return {"pieces": _joined(patches, held, rest[spread_out(held.positions[rest], spacing)])}, tracks
+
+
+def _tracks_of_several(tracked: Trajectories) -> np.ndarray | None:
+    """Positions of trajectories that no single camera placed, (N, T, 3), metres; None: there are none."""
+    lasting = tracked.lengths >= max(2, SHORT_FRACTION * tracked.n_frames)
+    chosen = np.flatnonzero(lasting & ~tracked.ray.any(axis=(1, 2)))
+    return tracked.positions[chosen].astype(float) if len(chosen) else None
 
 
 def _follow_nodes(job: Job, geometry: Geometry, anchors: MotionPaths | None) -> MotionPaths:
@@ -105,11 +117,16 @@ def point_paths(job: Job, geometry: Geometry) -> MotionPaths | None:
     GeometryError
         If these paths are asked for, and the scans have no points in common.
     """
+    tracks = _point_tracks(job, geometry)
+    return None if tracks is None else MotionPaths(tracks[evenly_over_surface(tracks)])
+
+
+def _point_tracks(job: Job, geometry: Geometry) -> np.ndarray | None:
+    """Tracks (N, T, 3), metres, of points that scans have in common; see `point_paths`."""
     wanted = job.config.segmentation.paths
     if wanted not in ("auto", "points") or not isinstance(geometry, Scans):
         return None
-    tracks = scan_tracks(geometry, wanted == "points" or geometry.tracked, job.progress)
-    return None if tracks is None else MotionPaths(tracks[evenly_over_surface(tracks)])
+    return scan_tracks(geometry, wanted == "points" or geometry.tracked, job.progress)
 
 
 def path_spacing(geometry: Geometry) -> float:
@@ -153,5 +170,5 @@ def _joined(patches: MotionPaths, nodes: MotionPaths, rest: np.ndarray) -> Motio
 
 def _anchors(tracked: Trajectories, spacing: float) -> MotionPaths | None:
     """Trajectories that nodes are held by; None: there are none."""
-    chosen = spread_out(tracked.positions, spacing, ANCHOR_FRACTION)
+    chosen = spread_out(tracked.positions, spacing, SHORT_FRACTION)
     return _paths_of(tracked, chosen) if len(chosen) else None

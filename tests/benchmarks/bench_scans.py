@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from data_tools.asset import AnimatedAsset
 from data_tools.figure import figure, mechanism
 from geomocap.bodies.motion_bodies import find_motion_bodies
-from geomocap.bodies.point_labels import label_points
+from geomocap.bodies.point_labels import Voters, label_points
 from geomocap.evaluation.body_scores import adjusted_rand_index
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.nodes.node_tracking import NodeTracks, track_nodes
@@ -41,7 +41,8 @@ def _rows(name: str, asset: AnimatedAsset) -> list[Row]:
     paths = nodes.motion_paths()
     bodies, finding = _timed(lambda: find_motion_bodies(paths))
     _, joining = _timed(lambda: find_motion_skeleton(bodies, 30.0))
-    ours = np.mean([adjusted_rand_index(label_points(bodies, paths, k, frames[k]), true[k]) for k in LOOKED_AT])
+    voters = Voters.of(bodies, paths)
+    ours = np.mean([adjusted_rand_index(label_points(voters, k, frames[k]), true[k]) for k in LOOKED_AT])
     count = len(asset.joint_names)
     clusters, clustering = _timed(lambda: _by_kmeans(skin, count))
     nearest = [cKDTree(skin.positions[:, k]).query(frames[k])[1] for k in LOOKED_AT]

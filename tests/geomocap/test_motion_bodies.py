@@ -9,7 +9,7 @@ from geomocap.bodies import body_elimination
 from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.bodies.motion_bodies import find_motion_bodies
 from geomocap.bodies.path_smoothing import smooth_paths
-from geomocap.bodies.point_labels import label_points
+from geomocap.bodies.point_labels import Voters, label_points
 from geomocap.bodies.surface_graph import surface_graph
 from geomocap.bodies.surface_noise import ring_misses, surface_noise
 from geomocap.errors import GeometryError
@@ -281,14 +281,14 @@ def test_joints_stay_fixed_in_both_bodies_and_follow_forward_kinematics(found):
 
 
 def test_points_of_any_frame_get_the_bodies_of_the_samples(three, found):
-    paths = MotionPaths(three.positions)
+    voters = Voters.of(found, MotionPaths(three.positions))
     rng = np.random.default_rng(5)
     for frame in (0, 13):
         points = three.positions[:, frame] + rng.normal(scale=0.003, size=(len(three.body), 3))
-        labels = label_points(found, paths, frame, points)
+        labels = label_points(voters, frame, points)
         assert labels.dtype == np.int32
         assert (labels == found.label).mean() > 0.95
-    assert len(label_points(found, paths, 0, np.empty((0, 3)))) == 0
+    assert len(label_points(voters, 0, np.empty((0, 3)))) == 0
 
 
 def test_wrong_paths_are_refused(three):

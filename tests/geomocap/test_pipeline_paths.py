@@ -87,18 +87,18 @@ def test_spacing_where_the_subject_comes_later() -> None:
 
 
 def test_nodes_leave_colours_alone(job):
-    found = motion_paths(job("nodes"), Ball(), False)
+    found = motion_paths(job("nodes"), Ball(), False)[0]
     assert list(found) == ["nodes"]
     assert found["nodes"].count == 60
 
 
 def test_patches_where_they_cover_the_subject(job):
-    assert list(motion_paths(job("auto", trajectories(500, 1.0)), Ball(), True)) == ["patches"]
+    assert list(motion_paths(job("auto", trajectories(500, 1.0)), Ball(), True)[0]) == ["patches"]
 
 
 def test_nodes_on_the_piece_that_patches_leave_uncovered(job):
     tracks = trajectories(20 * SAMPLES, 1.0, 0.0)
-    found = motion_paths(job("auto", tracks), Ball(), True)
+    found = motion_paths(job("auto", tracks), Ball(), True)[0]
     assert list(found) == ["pieces"]
     paths = found["pieces"]
     patches = patches_of(tracks)
@@ -119,7 +119,7 @@ def test_where_single_cameras_follow_less_than_half_of_the_surface_there_are_nod
     tracks = trajectories(300, 1.0, lowest)
     ray = np.zeros_like(tracks)
     ray[::2, :, 1] = 1.0
-    found = motion_paths(job("auto", tracks, ray), Ball(), True)
+    found = motion_paths(job("auto", tracks, ray), Ball(), True)[0]
     assert list(found) == kinds
     assert found["patches"].ray is not None
 
@@ -127,7 +127,7 @@ def test_where_single_cameras_follow_less_than_half_of_the_surface_there_are_nod
 def test_nodes_where_patches_are_there_for_a_while_only(job):
     tracks = trajectories(20 * SAMPLES, 1.0)
     tracks[:, 1:][tracks[:, 1:, 2] < 0] = np.nan  # 2 of 3 frames
-    found = motion_paths(job("auto", tracks), Ball(), True)
+    found = motion_paths(job("auto", tracks), Ball(), True)[0]
     assert list(found) == ["pieces"]
     patches = patches_of(tracks)
     nodes = found["pieces"].positions[patches.count :]
@@ -136,30 +136,30 @@ def test_nodes_where_patches_are_there_for_a_while_only(job):
 
 
 def test_nodes_without_patches(job):
-    assert list(motion_paths(job("auto"), Ball(), False)) == ["nodes"]
+    assert list(motion_paths(job("auto"), Ball(), False)[0]) == ["nodes"]
 
 
 def test_tracks_of_another_job_are_left_alone(job):
-    assert list(motion_paths(job("auto", trajectories(500, 1.0)), Ball(), False)) == ["nodes"]
+    assert list(motion_paths(job("auto", trajectories(500, 1.0)), Ball(), False)[0]) == ["nodes"]
 
 
 def test_both_although_patches_cover_the_subject(job):
-    assert list(motion_paths(job("both", trajectories(500, 1.0)), Ball(), True)) == ["both"]
+    assert list(motion_paths(job("both", trajectories(500, 1.0)), Ball(), True)[0]) == ["both"]
 
 
 def test_few_patches_where_they_are_asked_for(job):
-    assert list(motion_paths(job("patches", trajectories(100, 1.0, 0.8)), Ball(), True)) == ["patches"]
+    assert list(motion_paths(job("patches", trajectories(100, 1.0, 0.8)), Ball(), True)[0]) == ["patches"]
 
 
 def test_ellipsoids_of_the_paper(job):
-    paths = motion_paths(job("ellipsoids"), Ball(), False)["ellipsoids"]
+    paths = motion_paths(job("ellipsoids"), Ball(), False)[0]["ellipsoids"]
     middles = [Ball().points(k).mean(axis=0) for k in range(FRAMES)]
     np.testing.assert_allclose(paths.positions, [middles], atol=1e-6)  # the ball is one
 
 
 def test_patches_that_are_not_there(job):
     with pytest.raises(GeometryError, match=r"segmentation\.paths = nodes"):
-        motion_paths(job("patches"), Ball(), False)
+        motion_paths(job("patches"), Ball(), False)[0]
 
 
 def test_rays_go_with_the_paths_where_single_cameras_saw_them():
@@ -174,3 +174,13 @@ def test_rays_go_with_the_paths_where_single_cameras_saw_them():
     np.testing.assert_array_equal(found.ray, ray)
     np.testing.assert_allclose(found.sigma[::2, 1], 0.002 * ALONE_FRACTION)
     np.testing.assert_allclose(np.delete(found.sigma, 1, axis=1), 0.002)
+
+
+def test_tracks_that_paths_were_chosen_from_come_along(job):
+    tracks = trajectories(2 * SAMPLES, 1.0)
+    assert motion_paths(job("nodes", tracks), Ball(), False)[1] is None
+    ray = np.zeros_like(tracks)
+    ray[::2, :, 1] = 1.0  # the hull places what single cameras see
+    tracks[1, 1:] = np.nan
+    found = motion_paths(job("auto", tracks, ray), Ball(), True)[1]
+    np.testing.assert_allclose(found, tracks[3::2])
