@@ -117,15 +117,3 @@ def sure_part(misses: np.ndarray, ray: np.ndarray | None) -> np.ndarray:
     if ray is None:
         return misses
     return misses - (1.0 - DEPTH_FRACTION) * (misses * ray).sum(axis=-1, keepdims=True) * ray
-
-
-def within_ray(positions: np.ndarray, carried: np.ndarray, ray: np.ndarray | None) -> np.ndarray:
-    """Positions (…, 3) moved along their rays nearly to where a motion carries them.
-
-    To fit a motion to these, all directions counting the same, lowers the sum of squares of the sure parts of the
-    misses: it majorises that sum, and touches it at the motion so far (Hunter, Lange, A Tutorial on MM Algorithms,
-    2004).
-    """
-    if ray is None:
-        return positions
-    return positions - (1.0 - DEPTH_FRACTION**2) * ((positions - carried) * ray).sum(axis=-1, keepdims=True) * ray

@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from geomocap.bodies.body_settings import MotionBodiesSettings
@@ -18,7 +17,6 @@ from geomocap.skeleton.motion_skeleton import find_motion_skeleton
 from geomocap.skeleton.motion_skeleton_settings import RefinementSettings
 from geomocap.skeleton.motion_smoothness import Smoothness, accelerations
 from geomocap.skeleton.refinement import refine_motion, refine_skeleton
-from geomocap.skeleton.skinning import candidates_near, fit_fractions
 from tests.geomocap.moving_chains import Chain, chain, seen_by_single_cameras
 
 
@@ -170,44 +168,6 @@ def test_hinge_turns_about_its_axis_only():
     assert turn_errors_deg(found.bodies.rotations, scene.rotations).max() < 2.0
 
 
-def test_fractions_of_soft_skin_are_found():
-    scene = chain(3, samples=40)
-    linkage, motion, points = linked(scene)
-    bodies = body_motion(linkage, motion)
-    rng = np.random.default_rng(5)
-    weights = np.zeros((len(points), 3))
-    weights[:, :2] = rng.dirichlet([1.0, 1.0], len(points))
-    true = SkinPoints.of_weights(points.rest, weights)
-    seen = bodies.carry(true.rest, true.bodies, true.fractions).swapaxes(0, 1)
-    near = np.tile(np.array([0, 1, 2, -1], np.int32), (len(points), 1))
-    found = fit_fractions(points, bodies, seen, np.ones(seen.shape[:2]), near, np.full(len(points), 1e-12))
-    np.testing.assert_allclose(found.weights(3), true.weights(3), atol=0.011)  # fractions below 0.01 are dropped
-
-
-def test_fractions_are_the_least_squares_ones():
-    scene = chain(3, samples=30)
-    linkage, motion, points = linked(scene)
-    bodies = body_motion(linkage, motion)
-    rng = np.random.default_rng(6)
-    seen = scene.positions + rng.normal(0, 0.1, scene.positions.shape)
-    weights = rng.random(seen.shape[:2])
-    near = candidates_near(linkage, points)
-    pull = np.full(len(points), 1e-3)
-    found = fit_fractions(points, bodies, seen, weights, near, pull).weights(3)
-    for n in (0, 40, 80):
-        carried = np.einsum("tbij,j->tbi", bodies.rotations, points.rest[n]) + bodies.translations
-        present = points.weights(3)[n]
-
-        def cost(w, n=n, carried=carried, present=present):
-            square = ((seen[n] - np.einsum("b,tbi->ti", w, carried)) ** 2).sum(axis=1)
-            return (weights[n] * square).sum() / weights[n].sum() + pull[n] * ((w - present) ** 2).sum()
-
-        allowed = [(0.0, 1.0) if b in near[n] else (0.0, 0.0) for b in range(3)]
-        one = {"type": "eq", "fun": lambda w: w.sum() - 1.0}
-        best = minimize(cost, present, bounds=allowed, constraints=one, options={"ftol": 1e-12})
-        assert cost(found[n]) <= best.fun * 1.001 + 1e-9
-
-
 def test_right_sides_are_the_slopes_of_the_cost():
     linkage, motion, points = linked(chain(4))
     linkage = replace(linkage, hinge=np.array([True, False, True]))
@@ -254,7 +214,7 @@ def test_joint_that_is_none_does_not_bend_the_motion():
     loose = refine_motion(pair, start, skin, paths, 1.3, misses=np.array([0.1]))
     true = scene.rotations[:, [0, 2]]
     assert turn_errors_deg(held.bodies.rotations, true).mean() > 5.0
-    assert turn_errors_deg(loose.bodies.rotations, true).mean() < 0.1
+    assert turn_errors_deg(loose.bodies.rotations, true).mean() < 0.5
 
 
 def test_refinement_hardly_heeds_what_is_unsure_along_the_ray():
