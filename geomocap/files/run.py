@@ -49,8 +49,11 @@ _OWN = {  # folders of stages, and what is theirs there though no record says so
 }
 _RESULTS = (  # as stages call them
     *(f"{name}.npz" for name in ("diagnostics", "ellipsoids", "keypoints", "model", "skeleton", "tracks")),
-    *("motion.*", "angles.*", "check.json", "cameras.json", "correction.json", "sparse/cameras.txt"),
+    *(f"{name}.json" for name in ("cameras", "check", "correction", "diagnostics")),
+    *("motion.*", "angles.*", "sparse/cameras.txt"),
 )
+_SAID = "record"  # the stage that run.toml counts for
+_NAMED = tuple(name for name in _RESULTS if "*" not in name)  # those that no one else would call so
 
 
 def stage_key(module: str, *parts: Any) -> str:
@@ -181,6 +184,23 @@ class Run:
             record = StageRecord("made by a command", True)
         self._write_files(stage, record, [f for f in files if f.is_relative_to(self.path)])
 
+    def clear(self) -> None:
+        """Delete all that stages and commands wrote, and know nothing of it any more; files of others stay.
+
+        Raises
+        ------
+        RunError
+            If something can't be deleted.
+        """
+        try:
+            for stage in sorted(stages(self.path), key=lambda name: name == _SAID):  # what it was made from goes last
+                outputs = read_record(self.path, stage).outputs
+                self._clear(stage, (*_OWN, *_NAMED, TIMINGS, *outputs), ())
+                forget_record(self.path, stage)
+            (self.path / RECORD).unlink(missing_ok=True)
+        except OSError as error:
+            raise RunError(f"{self.path}: its results can't be deleted ({error.strerror})") from None
+
     def forget(self, stage: str) -> None:
         """Know nothing of a stage any more; its files stay."""
         forget_record(self.path, stage)
@@ -259,7 +279,7 @@ class Run:
         whole |= {name: table for name, table in record.items() if name != "geomocap"}
         whole["geomocap"]["entries"] = count_values(whole)
         write_text(self.path / RECORD, tomli_w.dumps(whole))
-        self.renew("record", [self.path / RECORD])
+        self.renew(_SAID, [self.path / RECORD])
 
     def read_record(self) -> dict[str, Any]:
         """Read `run.toml`.

@@ -76,6 +76,8 @@ class Job:
     ) -> str:
         """Do a stage's work, unless it has been done with the same key; return the key.
 
+        What the run holds of another source is removed first.
+
         Parameters
         ----------
         name, key : str
@@ -88,6 +90,7 @@ class Job:
         derived : sequence of str
             Files and folders that others make from its outputs, deleted as well when the key has changed.
         """
+        self._leave_other_source()
         if not self.run.is_done(name, key):
             faults = self.run.begin(name, key, outputs, optional, derived)
             if faults:
@@ -110,15 +113,17 @@ class Job:
     def write_record(self, *tables: str) -> None:
         """Write `run.toml`: source, settings and versions, enough to repeat the run.
 
+        What the run holds of another source is removed first.
+
         Parameters
         ----------
         *tables : str
             Tables of the settings to write: the other ones, and the model, stay as recorded before if the source is
             the same. By default all is written anew.
         """
-        path = self.capture.path if self.capture is not None else self.scans.source if self.scans is not None else None
+        path = self._source_path
         source: dict[str, Any] = {
-            "kind": "capture" if self.capture is not None else "scans",
+            "kind": self._kind,
             **({} if path is None else source_places(self.run.path, path)),
             "fps": self.fps,
             "up": self.up,
@@ -126,7 +131,9 @@ class Job:
         if isinstance(self.capture, PreviewCapture):
             source["preview"] = self.capture.record
         self.run.claim()
-        before = self._recorded(source) if tables else {}
+        self._leave_other_source()
+        before = self._recorded() if tables else {}
+        before = before if self._is_source(before) else {}
         model = before.get("source", {}).get("model") if self.model is None else os.path.abspath(self.model)
         kept = before.get("config", {})
         settings = self.config.model_dump(mode="json", exclude_none=True)
@@ -141,12 +148,44 @@ class Job:
             }
         )
 
-    def _recorded(self, source: dict[str, Any]) -> dict[str, Any]:
-        """Read the run's record; empty if there is none of this source."""
-        record = self.run.read_record() if (self.run.path / "run.toml").is_file() else {}
-        before = record.get("source", {})
-        there = source_path(self.run.path, before).resolve() == Path(source.get("path", "")).resolve()
-        return record if there and before.get("kind", "") == source["kind"] else {}
+    @property
+    def _kind(self) -> str:
+        return "capture" if self.capture is not None else "scans"
+
+    @property
+    def _source_path(self) -> Path | None:
+        if self.capture is not None:
+            return self.capture.path
+        return None if self.scans is None else self.scans.source
+
+    def _recorded(self) -> dict[str, Any]:
+        """Read the run's record; empty if there is none."""
+        return self.run.read_record() if (self.run.path / "run.toml").is_file() else {}
+
+    def _is_source(self, record: dict[str, Any]) -> bool:
+        """Whether a record of the run is of this job's source."""
+        before, path = record.get("source", {}), self._source_path
+        if path is None or "path" not in before or before.get("kind") != self._kind:
+            return False
+        if before["path"] == source_places(self.run.path, path)["path"]:
+            return True
+        return source_path(self.run.path, before).resolve() == path.resolve()
+
+    def _leave_other_source(self) -> None:
+        """Remove what the run holds of a source that is not this job's, as its results say nothing of this one."""
+        path = self._source_path
+        if path is None or path.resolve().is_relative_to(self.run.path.resolve()):  # nor is what is read removed
+            return
+        record = self._recorded()
+        if "path" not in record.get("source", {}) or self._is_source(record):
+            return
+        before = record["source"]
+        names = "; names.toml stays, see that its names fit" if self.run.has("names.toml") else ""
+        self.tell(
+            f"{self.run.path}: held results of {before.get('kind', '?')} {source_path(self.run.path, before)}, which "
+            f"are removed{names}"
+        )
+        self.run.clear()
 
     @property
     def up(self) -> str:
