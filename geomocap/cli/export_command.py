@@ -15,7 +15,6 @@ from geomocap.cli.reports import existing_run, tell_faults, working
 from geomocap.cli.settings_options import with_settings
 from geomocap.config import Config
 from geomocap.export.run_export import Exported, export_run
-from geomocap.export.run_names import NAMES_FOUND
 from geomocap.files.atomic import write_bytes
 from geomocap.files.result_schemas import skeleton_gaps
 from geomocap.files.results import read_skeleton
@@ -63,14 +62,13 @@ def export(
     with working(run, wait) if out is None else nullcontext(), progress_bars() as progress:
         tell_faults(opened)
         exported = export_run(opened, formats, settings, folder=out, progress=progress)
-        written = list(exported.files.values())
+        touched = list(exported.touched)
         if angles and exported.angles is not None and exported.angles.names:
             picture = exported.files["angles"].with_suffix(".png")
             write_bytes(picture, angle_sheet(exported.angles))
-            written.append(picture)
+            touched.append(picture)
         if out is None:
-            named = [run / NAMES_FOUND] * (exported.found.template is not None)
-            opened.renew("export", [*written, *named])
+            opened.renew("export", touched)
     report_exported(exported)
     for gap in skeleton_gaps(read_skeleton(opened)):
         console.print(f"note: {gap}")

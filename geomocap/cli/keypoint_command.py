@@ -110,5 +110,5 @@ def _report(run: Run, file: KeyPointFile, found: FollowedKeyPoints) -> None:
         console.print(f"not written: {reason}", markup=False)
     if run.has(SKELETON):
         exported = export_run(run)
-        run.renew("export", exported.files.values())
+        run.renew("export", exported.touched)
         report_exported(exported)

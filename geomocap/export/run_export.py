@@ -71,6 +71,8 @@ class Exported:
     Attributes
     ----------
     files : dict of format to path
+    names_file : Path
+        Where names from a template are listed; removed if there are none.
     skipped : dict of format to reason
         Formats that were not asked for by name and could not be written.
     deviation_mm : float
@@ -84,11 +86,17 @@ class Exported:
     """
 
     files: dict[str, Path]
+    names_file: Path
     skipped: dict[str, str] = field(default_factory=dict)
     deviation_mm: float = 0.0
     moving_joints: tuple[str, ...] = ()
     found: FoundNames = field(default_factory=FoundNames)
     angles: AngleSet | None = None
+
+    @property
+    def touched(self) -> tuple[Path, ...]:
+        """Files that were written, and the one that may have been removed, as the run's record wants to know."""
+        return (*self.files.values(), self.names_file)
 
 
 def export_run(
@@ -172,7 +180,8 @@ def export_run(
     else:
         listed.unlink(missing_ok=True)
     shifting = tuple(n for n, m, j in zip(motion.names, motion.moving, motion.joints, strict=True) if m and j >= 0)
-    return Exported(files, skipped, motion.largest_deviation_mm(skeleton.joint_positions), shifting, found, angles)
+    deviation = motion.largest_deviation_mm(skeleton.joint_positions)
+    return Exported(files, listed, skipped, deviation, shifting, found, angles)
 
 
 def run_settings(run: Run) -> ExportSettings:

@@ -178,11 +178,13 @@ class Run:
         self._write_files(stage, replace(record, done=True), files)
 
     def renew(self, stage: str, files: Iterable[Path]) -> None:
-        """Take files of the run as those of a stage from now on: a command has written them."""
-        record = read_record(self.path, stage)
+        """Take files of the run as those of a stage from now on: a command has written them, or removed those gone."""
+        record, own = read_record(self.path, stage), [f for f in files if f.is_relative_to(self.path)]
         if not record.key:  # the stage itself will make them anew
             record = StageRecord("made by a command", True)
-        self._write_files(stage, record, [f for f in files if f.is_relative_to(self.path)])
+        gone = {f.relative_to(self.path).as_posix() for f in own if not f.exists()}
+        kept = {name: mark for name, mark in record.files.items() if name not in gone}
+        self._write_files(stage, replace(record, files=kept), own)
 
     def clear(self) -> None:
         """Delete all that stages and commands wrote, and know nothing of it any more; files of others stay.

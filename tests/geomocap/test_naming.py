@@ -239,6 +239,17 @@ def test_the_users_names_go_first_and_none_means_numbers(run, tmp_path):
         export_run(run, ["trc"], ExportSettings(names="snail"))
 
 
+def test_a_list_of_names_that_an_export_removes_is_not_missed_by_the_run(run):
+    run.renew("export", export_run(run, ["trc"]).touched)
+    (run.path / "names_found.toml").unlink()
+    assert run.faults() == {"names_found.toml": "missing"}
+    run.renew("export", export_run(run, ["bvh"], ExportSettings(names="none")).touched)
+    assert run.faults() == {}
+    (run.path / "motion.trc").unlink()
+    run.renew("export", export_run(run, ["bvh"]).touched)
+    assert run.faults() == {"motion.trc": "missing"}, "what others removed is"
+
+
 def test_what_the_user_names_by_words_of_a_template_is_known_as_that():
     skeleton, labels = figure(HUMAN, turn=0.7)
     given = dict(enumerate(labels))
