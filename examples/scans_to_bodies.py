@@ -11,16 +11,21 @@ from pathlib import Path
 import numpy as np
 
 import geomocap
+from geomocap.files.scan_checks import scan_doubts
 from geomocap.files.scan_tracks import scan_tracks
 
 
-def scans_to_bodies(folder: Path, fps: float, scale: float = 1.0) -> tuple[geomocap.Motion, list[np.ndarray]]:
-    """Return the motion, and the body of each point of each scan, T arrays (N,) int."""
+def scans_to_bodies(
+    folder: Path, fps: float, scale: float = 1.0
+) -> tuple[geomocap.Motion, list[np.ndarray], tuple[str, ...]]:
+    """Return the motion, the body of each point of each scan, T arrays (N,) int, and what is doubtful."""
     scans = geomocap.open_scans(folder, geomocap.ScanSettings(scale=scale))
     points = [scans.points(frame) for frame in range(len(scans))]
+    doubts = scan_doubts(points.__getitem__, scans.names)  # of unit and shape
     tracks = scan_tracks(scans)  # None unless the scans have their points in common
     motion = geomocap.find_motion(points if tracks is None else tracks, fps=fps)
-    return motion, [motion.label(frame, points[frame]) for frame in range(len(scans))]
+    labels = [motion.label(frame, points[frame]) for frame in range(len(scans))]
+    return motion, labels, (*doubts, *motion.warnings)
 
 
 def main() -> None:
@@ -31,12 +36,12 @@ def main() -> None:
     parser.add_argument("--scale", type=float, default=1.0, help="metres per unit of the scans")
     parser.add_argument("--labels", type=Path, help="file for the bodies of all points, NPZ")
     arguments = parser.parse_args()
-    motion, labels = scans_to_bodies(arguments.scans, arguments.fps, arguments.scale)
+    motion, labels, warnings = scans_to_bodies(arguments.scans, arguments.fps, arguments.scale)
     print(f"{motion.body_count} bodies in {len(labels)} scans")
     skeleton = motion.skeleton
     for name, ends, hinge in zip(skeleton.joint_names, skeleton.joint_bodies, motion.joint_is_hinge, strict=True):
         print(f"{name}: {'hinge' if hinge else 'ball'} between bodies {ends[0]} and {ends[1]}")
-    for warning in motion.warnings:
+    for warning in warnings:
         print(f"warning: {warning}")
     if arguments.labels is not None:
         np.savez_compressed(arguments.labels, **{f"frame_{k:06d}": body for k, body in enumerate(labels)})

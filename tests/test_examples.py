@@ -56,12 +56,13 @@ def test_a_capture_to_a_skeleton(tmp_path, monkeypatch, capsys):
 
 def test_any_scans_to_bodies(tmp_path, monkeypatch, capsys):
     truth = chain(3)
-    np.savez(tmp_path / "scans.npz", points=truth.positions.swapaxes(0, 1))
+    np.savez(tmp_path / "scans.npz", points=1000 * truth.positions.swapaxes(0, 1))
     run_example("scans_to_bodies", monkeypatch, tmp_path / "scans.npz", "--labels", tmp_path / "labels.npz")
     frames = truth.positions.shape[1]
     told = capsys.readouterr().out.splitlines()
     assert told[0] == f"3 bodies in {frames} scans"
     assert sum(" between bodies " in line for line in told) == 2
+    assert "likely no metres" in told[-1]
     labels = np.load(tmp_path / "labels.npz")
     assert len(labels.files) == frames
     assert same_partition(labels["frame_000000"], truth.body)

@@ -29,7 +29,7 @@ ModelFile = Annotated[
 Wait = Annotated[bool, typer.Option("--wait", help="If another process works in RUN, wait until it has ended.")]
 Pictures = Annotated[bool, typer.Option(help="Make review pictures and the report.")]
 MetresPerUnit = Annotated[
-    float, typer.Option("--metres-per-unit", min=1e-9, help="Metres in a unit of the calibration.")
+    float, typer.Option("--metres-per-unit", min=1e-9, help="Metres in a unit of the calibration, or of scans.")
 ]
 Workers = Annotated[
     int | None,

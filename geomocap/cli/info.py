@@ -31,7 +31,7 @@ def info(
     """
     rig = foreign_calibration(path, metres_per_unit)
     if rig is None:
-        told = describe(path)
+        told = describe(path, metres_per_unit)
     else:
         told = Description(path, "calibration")
         describe_rig(rig, told)

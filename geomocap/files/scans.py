@@ -71,7 +71,10 @@ class Scans:
         GeometryError
             As `surface` does.
         """
-        surface = self.surface(frame)
+        return self.points_of(self.surface(frame), frame)
+
+    def points_of(self, surface: ScanSurface, frame: int) -> np.ndarray:
+        """Return the points of a frame whose surface has been read, as `points` does."""
         if surface.faces is None:
             return surface.points[~np.isnan(surface.points).any(axis=1)]
         return self.places(surface, frame).of(surface.points)

@@ -19,8 +19,14 @@ class InspectionError(GeomocapError):
     """A path that is nothing that geomocap knows."""
 
 
-def describe(path: Path) -> Description:
+def describe(path: Path, metres_per_unit: float = 1.0) -> Description:
     """Describe a capture, run, calibration, truth, motion file or scans; what is wrong is part of the description.
+
+    Parameters
+    ----------
+    path : Path
+    metres_per_unit : float
+        Of scans.
 
     Raises
     ------
@@ -40,7 +46,7 @@ def describe(path: Path) -> Description:
             if any((folder / f"cameras{ending}").is_file() for ending in (".txt", ".bin")):
                 return describe_calibration(folder)
         if any(file.suffix.lower() in SCAN_ENDINGS for file in path.iterdir()):
-            return describe_scans(path)
+            return describe_scans(path, metres_per_unit)
         raise InspectionError(
             f"{path}: neither a capture (capture.toml), a run (run.toml), a truth (truth.npz), a calibration "
             f"(cameras.txt or cameras.bin) nor scans ({', '.join(e[1:] for e in SCAN_ENDINGS)})"
@@ -50,7 +56,7 @@ def describe(path: Path) -> Description:
     if path.suffix.lower() in ENDINGS:
         return describe_motion_file(path)
     if path.suffix.lower() in SCAN_ENDINGS:
-        return describe_scans(path)
+        return describe_scans(path, metres_per_unit)
     raise InspectionError(
         f"{path}: no known kind of file; motion files are {', '.join(ENDINGS)}, scans {', '.join(SCAN_ENDINGS)}"
     )

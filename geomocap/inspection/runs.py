@@ -11,6 +11,7 @@ from geomocap.errors import GeomocapError
 from geomocap.export.run_export import FILES
 from geomocap.export.skeleton_motion import motion_from_skeleton
 from geomocap.files.atomic import remains
+from geomocap.files.camera_file import read_camera_doubts
 from geomocap.files.results import (
     ELLIPSOIDS,
     KEYPOINTS,
@@ -20,6 +21,7 @@ from geomocap.files.results import (
     read_ellipsoids,
     read_keypoint_paths,
     read_skeleton,
+    read_warnings,
 )
 from geomocap.files.run import Run
 from geomocap.files.run_records import source_path
@@ -67,8 +69,18 @@ def describe_run(path: Path) -> Description:
                 told.problem(error)
     files = [f for f in FILES.values() if (path / f).is_file()]
     told.fact("motion files", shortened(files) if files else "none")
+    _warnings(run, told)
     _stages(run, told)
     return told
+
+
+def _warnings(run: Run, told: Description) -> None:
+    """Say what made the results doubtful when they were made."""
+    try:
+        for warning in (*read_camera_doubts(run).warnings, *read_warnings(run)):
+            told.problem(warning)
+    except GeomocapError as error:
+        told.problem(error)
 
 
 def _ellipsoids(run: Run, told: Description) -> None:

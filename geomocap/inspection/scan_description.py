@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geomocap.errors import GeomocapError
+from geomocap.errors import GeometryError, GeomocapError
+from geomocap.files.scan_checks import scan_doubts
 from geomocap.files.scan_geometry import ScanSurface
 from geomocap.files.scan_settings import ScanSettings
 from geomocap.files.scan_tracks import scan_tracks
@@ -15,11 +16,11 @@ from geomocap.inspection.capture_description import MOST_NAMED
 from geomocap.inspection.description import Description, count
 
 
-def describe_scans(path: Path) -> Description:
-    """Describe a folder or file of scans, all of which are read."""
+def describe_scans(path: Path, scale: float = 1.0) -> Description:
+    """Describe a folder or file of scans, all of which are read; `scale` are metres per unit of theirs."""
     told = Description(path, "scans")
     try:
-        scans = open_scans(path, ScanSettings())
+        scans = open_scans(path, ScanSettings(scale=scale))
     except GeomocapError as error:
         told.problem(error)
         return told
@@ -38,13 +39,26 @@ def describe_scans(path: Path) -> Description:
         told.fact("missing points", f"{missing:.1%} (NaN)")
     low = np.min([np.nanmin(s.points, axis=0) for s in surfaces], axis=0)
     high = np.max([np.nanmax(s.points, axis=0) for s in surfaces], axis=0)
-    told.fact("box around all", " × ".join(f"{side:.4g}" for side in high - low) + ", taken for metres (--scale)")
+    taken = " m" if scale != 1 else ", taken for metres (--metres-per-unit)"
+    told.fact("box around all", " × ".join(f"{side:.4g}" for side in high - low) + taken)
     if len(scans) == 1:
         told.fact("motion", "none: one scan gets its ellipsoids")
     elif not told.problems:
         common = scans.tracked or scan_tracks(scans) is not None
         told.fact("points in common", "yes, they are taken as tracks" if common else "no, the surface is followed")
+        _compare(scans, surfaces, told)
     return told
+
+
+def _compare(scans: Scans, surfaces: list[ScanSurface], told: Description) -> None:
+    """Say what a segmentation would refuse or warn of."""
+    try:
+        doubts = scan_doubts(lambda frame: scans.points_of(surfaces[frame], frame), scans.names)
+    except GeometryError as error:
+        told.problem(error)
+        return
+    for doubt in doubts:
+        told.problem(doubt)
 
 
 def _read(scans: Scans, told: Description) -> list[ScanSurface]:

@@ -6,7 +6,10 @@ from cv2 import imwrite
 
 from geomocap.export.run_export import export_run
 from geomocap.files.atomic import temporary_beside
+from geomocap.files.camera_file import CameraDoubts, write_camera_doubts
+from geomocap.files.results import write_warnings
 from geomocap.files.rigs import write_rig
+from geomocap.files.run import Run
 from geomocap.inspection import describe
 from geomocap.inspection.describe import InspectionError
 from geomocap.model.rig import Rig
@@ -138,8 +141,6 @@ def test_a_truth(tmp_path):
 
 @pytest.fixture
 def motion_files(tmp_path):
-    from geomocap.files.run import Run
-
     run = Run(tmp_path / "run")
     run.write_npz("skeleton.npz", **skeleton_arrays())
     return export_run(run, ["bvh", "trc", "glb"]).files
@@ -192,6 +193,34 @@ def test_scans(tmp_path):
     mesh.export(tmp_path / "box.ply")
     facts = dict(describe(tmp_path / "box.ply").facts)
     assert facts["meshes"] == "8 vertices, 12 triangles" and "one scan" in facts["motion"]
+
+
+def test_what_a_segmentation_warns_of_or_refuses_is_wrong_with_scans(tmp_path):
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(4, 50, 3))
+    flat, line = points * (1, 1, 0), points * (1, 0, 0)
+    says = {
+        "millimetres": (1000 * points, "which are likely no metres; set scans.scale"),
+        "flat": (flat, "and those of 3 more scans lie in a plane"),
+        "axes": (line, "all its points lie in a line"),
+    }
+    for name, (found, text) in says.items():
+        np.savez(tmp_path / f"{name}.npz", points=found)
+        told = describe(tmp_path / f"{name}.npz")
+        assert len(told.problems) == 1 and text in told.problems[0]
+        assert "points in common" in dict(told.facts)
+    told = describe(tmp_path / "millimetres.npz", metres_per_unit=0.001)
+    assert told.problems == [] and dict(told.facts)["box around all"].endswith(" m")
+
+
+def test_what_was_doubtful_when_a_run_was_made_is_wrong_with_it(tmp_path):
+    run = Run(tmp_path / "run")
+    run.write_npz("skeleton.npz", **skeleton_arrays())
+    run.write_record({"source": {"up": "z"}})
+    assert describe(run.path).problems == []
+    write_warnings(run, ["the scans are 824 m across"])
+    write_camera_doubts(run, CameraDoubts(("cam02",), (), ("camera cam02 is mirrored",)))
+    assert describe(run.path).problems == ["camera cam02 is mirrored", "the scans are 824 m across"]
 
 
 def test_nothing_known(tmp_path):
