@@ -17,6 +17,8 @@ from viz.rendering import Look, Model
 from viz.run_contents import Results
 from viz.viewpoints import camera_view
 
+MANY_UNASSIGNED = 0.1  # fraction of the points; more without a body are warned of
+
 
 @dataclass(frozen=True)
 class Coverage:
@@ -219,7 +221,8 @@ def assess(results: Results, frames: list[int]) -> Quality:
     unassigned = None
     if "bodies" in results.kinds:
         labels = [results.bodies(f).body for f in frames if results.has("bodies", f)]
-        unassigned = float(np.mean(np.concatenate(labels) < 0)) if labels else None
+        if labels and (len(results.frames) > 1 or any((of_frame >= 0).any() for of_frame in labels)):
+            unassigned = float(np.mean(np.concatenate(labels) < 0))  # of one frame bodies are not looked for
     quality = Quality(cover, agree, bone_list, shaking, unassigned)
     return Quality(cover, agree, bone_list, shaking, unassigned, [*results.remarks, *warnings(results, quality)])
 
@@ -270,7 +273,7 @@ def warnings(results: Results, quality: Quality) -> list[str]:
     ellipsoids, skeleton = results.ellipsoids, results.skeleton
     if ellipsoids is not None and ellipsoids.body_count == 1:
         said.append("Only one body was found: nothing moves against anything else, or the threshold is too high.")
-    if quality.unassigned is not None and quality.unassigned > 0.1:
+    if quality.unassigned is not None and quality.unassigned > MANY_UNASSIGNED:
         said.append(f"{100 * quality.unassigned:.0f} % of the points belong to no body.")
     varying = [b for b in quality.bones if b.spread > 0.1 * b.mean]
     if varying:

@@ -10,7 +10,7 @@ import tomli_w
 from geomocap.files.check_file import read_self_check
 from geomocap.files.results import read_diagnostics
 from viz.body_colors import body_color, hex_color
-from viz.quality_figures import Quality
+from viz.quality_figures import MANY_UNASSIGNED, Quality
 from viz.report import Block, Section, missing, table, text
 from viz.run_contents import Results
 
@@ -259,7 +259,7 @@ def figures_of_quality(results: Results, quality: Quality) -> list[Block]:
         colors = [hex_color(body_color(int(b))) for b in results.skeleton.joint_bodies[:, 1]]
         head = ("joint", "unrest: median second difference (mm)")
         blocks += [Block("heading", "Unrest of the joints"), table(head, rows, (1,), colors)]
-    if quality.unassigned is not None:
+    if quality.unassigned is not None and quality.unassigned <= MANY_UNASSIGNED:  # else a warning says it
         blocks.append(text(f"{100 * quality.unassigned:.1f} % of the points belong to no body."))
     return blocks
 

@@ -85,7 +85,7 @@ def _warnings(run: Run, told: Description) -> None:
 
 def _ellipsoids(run: Run, told: Description) -> None:
     found = read_ellipsoids(run)
-    bodies = count(len(np.unique(found.bodies)), "body", "bodies")
+    bodies = count(len(np.unique(found.bodies[found.bodies >= 0])), "body", "bodies")
     told.fact("ellipsoids", f"{len(found)} in {count(found.frame_count, 'frame')}, of {bodies}")
 
 

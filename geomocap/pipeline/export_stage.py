@@ -7,6 +7,7 @@ from pathlib import Path
 from geomocap.export.run_export import FILES, export_run
 from geomocap.export.run_names import NAMES_FOUND
 from geomocap.files.atomic import fingerprint
+from geomocap.files.results import ELLIPSOIDS, SKELETON
 from geomocap.files.run import stage_key
 from geomocap.pipeline.check_stage import check
 from geomocap.pipeline.job import Job
@@ -18,7 +19,11 @@ def motion_files(job: Job, source: Source) -> str:
     """Take a capture or scans all the way to the motion files, as the record says then; return the stage's key."""
     job.write_record()
     segmented = segment(job, source)
-    if not (job.run.path / "skeleton.npz").exists():
+    if not job.run.has(SKELETON):
+        job.tell(
+            f"{job.source}: a single frame shows no motion; joints and motion files take more frames, {ELLIPSOIDS} "
+            "and bodies/ were made"
+        )
         return segmented
     check(job, segmented)
     named = Path(job.config.export.names)

@@ -121,7 +121,7 @@ class Job:
             Tables of the settings to write: the other ones, and the model, stay as recorded before if the source is
             the same. By default all is written anew.
         """
-        path = self._source_path
+        path = self.source
         source: dict[str, Any] = {
             "kind": self._kind,
             **({} if path is None else source_places(self.run.path, path)),
@@ -153,7 +153,8 @@ class Job:
         return "capture" if self.capture is not None else "scans"
 
     @property
-    def _source_path(self) -> Path | None:
+    def source(self) -> Path | None:
+        """Folder of the capture, or file or folder of the scans; None of neither."""
         if self.capture is not None:
             return self.capture.path
         return None if self.scans is None else self.scans.source
@@ -164,7 +165,7 @@ class Job:
 
     def _is_source(self, record: dict[str, Any]) -> bool:
         """Whether a record of the run is of this job's source."""
-        before, path = record.get("source", {}), self._source_path
+        before, path = record.get("source", {}), self.source
         if path is None or "path" not in before or before.get("kind") != self._kind:
             return False
         if before["path"] == source_places(self.run.path, path)["path"]:
@@ -173,7 +174,7 @@ class Job:
 
     def _leave_other_source(self) -> None:
         """Remove what the run holds of a source that is not this job's, as its results say nothing of this one."""
-        path = self._source_path
+        path = self.source
         if path is None or path.resolve().is_relative_to(self.run.path.resolve()):  # nor is what is read removed
             return
         record = self._recorded()

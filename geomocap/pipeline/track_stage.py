@@ -56,7 +56,13 @@ def tracks(job: Job) -> str:
     key = stage_key(__name__, "tracks", surface, pictures, settings, job.fps, windows)
     job.write_record(*tables, "windows")
     work = partial(_track, job, capture) if len(windows) == 1 else partial(_track_windows, job, capture, windows)
-    return job.stage("tracks", key, [TRACKS], work, derived=KEYPOINT_FILES)
+    job.stage("tracks", key, [TRACKS], work, derived=KEYPOINT_FILES)
+    if capture.n_frames == 1:
+        job.tell(
+            f"{capture.path}: a single frame shows no motion; trajectories take more frames, {TRACKS} was made "
+            "without any"
+        )
+    return key
 
 
 def _track(job: Job, capture: Capture) -> int:

@@ -15,6 +15,7 @@ from geomocap.export.trc import read_trc
 from geomocap.files.capture import Capture
 from geomocap.files.run import Run
 from geomocap.files.scans import open_scans
+from geomocap.inspection import describe
 from geomocap.motion import evenly_over_surface
 from geomocap.pipeline import Job, motion_files, segment
 from geomocap.pipeline.derived import KEYPOINT_FILES
@@ -40,6 +41,17 @@ def job(tmp_path):
 
 def scanned(frames: int) -> np.ndarray:
     return chain(2, frames, samples=200).positions.swapaxes(0, 1)
+
+
+def test_of_a_single_frame_is_told_that_motion_takes_more(job):
+    told: list[str] = []
+    one = replace(job(scanned(2)[:1], M3), tell=told.append)
+    for _ in range(2):
+        motion_files(one, "scans")
+    assert len(told) == 2 and told[0] == told[1]
+    assert "scans.npy: a single frame shows no motion" in told[0] and "ellipsoids.npz and bodies/ were made" in told[0]
+    assert not one.run.has("skeleton.npz") and one.run.faults() == {}
+    assert dict(describe(one.run.path).facts)["ellipsoids"].endswith("in 1 frame, of 0 bodies")
 
 
 def test_scans_leave_tracks_of_a_capture_alone(job):

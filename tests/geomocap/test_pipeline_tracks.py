@@ -48,6 +48,17 @@ def test_tracks_lie_on_the_hull_where_it_is_all_there_can_be(tmp_path, monkeypat
     assert asked == [surface]
 
 
+def test_of_a_single_frame_is_told_that_trajectories_take_more(tmp_path, monkeypatch):
+    monkeypatch.setattr(stage, "clouds", lambda job: "surface")
+    monkeypatch.setattr(stage, "_track", lambda job, capture: job.run.write_npz("tracks.npz") or 1)
+    told: list[str] = []
+    capture = make_capture(tmp_path / "capture")
+    with threads(1) as executor:
+        job = Job(Run(tmp_path / "run"), load_config(), executor, capture=capture, fps=capture.fps, tell=told.append)
+        stage.tracks(job)
+    assert len(told) == 1 and told[0].startswith(f"{capture.path}: a single frame shows no motion; trajectories take")
+
+
 def test_key_points_go_with_the_tracks_they_were_followed_in(tmp_path, monkeypatch):
     monkeypatch.setattr(stage, "clouds", lambda job: "surface")
     monkeypatch.setattr(stage, "_track", lambda job, capture: job.run.write_npz("tracks.npz") or 1)

@@ -16,9 +16,10 @@ from scipy.spatial.transform import Rotation
 from geomocap.errors import RunError
 from geomocap.files.atomic import write_text
 from geomocap.files.camera_file import CameraDoubts, write_camera_doubts
-from geomocap.files.frame_files import ply_count
+from geomocap.files.frame_files import ply_count, write_points
 from geomocap.files.run import Run
 from geomocap.model.diagnostics import Diagnostics
+from geomocap.model.frame_geometry import BodyPoints
 from geomocap.model.rotations import rotation_vectors
 from tests.viz.conftest import LIMBS, Made
 from viz import review, scene
@@ -177,6 +178,15 @@ def test_one_scan_has_no_video_and_no_paths(made: Made, tmp_path: Path) -> None:
     files = review(Run(tmp_path))
     assert not [f for f in files if f.suffix == ".mp4"]
     assert "a scan" in files[-1].read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(("fraction", "times"), [(1.0, 0), (0.5, 1), (0.05, 1)])
+def test_points_without_a_body_are_told_once_and_not_where_none_was_looked_for(tmp_path, fraction, times) -> None:
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    label = np.where(np.arange(200) < 200 * fraction, -1, 0).astype(np.int32)
+    write_points(Run(tmp_path).frame_file("bodies", 0), BodyPoints(points, label))
+    page = review(Run(tmp_path))[-1].read_text(encoding="utf-8")
+    assert page.count("% of the points belong to no body") == times
 
 
 def test_empty_run_and_unknown_frame_are_refused(made: Made, tmp_path: Path) -> None:
