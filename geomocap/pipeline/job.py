@@ -174,9 +174,9 @@ class Job:
 
     def _leave_other_source(self) -> None:
         """Remove what the run holds of a source that is not this job's, as its results say nothing of this one."""
-        path = self.source
-        if path is None or path.resolve().is_relative_to(self.run.path.resolve()):  # nor is what is read removed
-            return
+        read = [path.resolve() for path in (self.source, self.model) if path is not None]
+        if self.source is None or any(path.is_relative_to(self.run.path.resolve()) for path in read):
+            return  # what is read is not removed
         record = self._recorded()
         if "path" not in record.get("source", {}) or self._is_source(record):
             return

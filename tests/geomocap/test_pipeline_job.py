@@ -136,10 +136,13 @@ def test_results_of_the_same_source_stay_where_both_are_moved(job, used, tmp_pat
     assert files_of(Run(moved / "run")) == before and told == []
 
 
-def test_what_is_read_from_the_run_itself_stays(used):
+def test_what_is_read_from_the_run_itself_stays(used, tmp_path):
     np.save(used.path / "scans.npy", np.random.default_rng(0).normal(size=(2, 9, 3)))
     before = files_of(used)
     Job(used, Config(), None, scans=open_scans(used.path / "scans.npy", ScanSettings())).write_record()
+    np.save(tmp_path / "scans.npy", np.zeros((2, 9, 3)))
+    scans = open_scans(tmp_path / "scans.npy", ScanSettings())
+    Job(used, Config(), None, scans=scans, model=used.path / "model.npz").write_record()
     assert files_of(used) == before
 
 
