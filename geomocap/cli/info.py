@@ -25,7 +25,7 @@ def info(
     metres_per_unit: MetresPerUnit = 1.0,
     workers: Workers = None,
 ) -> None:
-    """Say what a capture, a run, a calibration, a truth, a motion file or scans hold, and what is wrong with them.
+    """Say what a capture, a run, a calibration, a truth, a motion file or scans hold, what is wrong with them, and what is doubtful.
 
     The exit status is 1 if something is wrong.
     """
@@ -43,6 +43,8 @@ def info(
         console.print(table)
     for problem in told.problems:
         console.print(f"wrong: {problem}", markup=False)
-    if not told.problems:
+    for doubt in told.doubts:
+        console.print(f"doubtful: {doubt}", markup=False)
+    if not told.problems and not told.doubts:
         console.print("nothing wrong with it")
     raise typer.Exit(1 if told.problems else 0)

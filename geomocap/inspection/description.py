@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Description:
-    """What something is, what it holds, and what is wrong with it.
+    """What something is, what it holds, what is wrong with it, and what is doubtful.
 
     Attributes
     ----------
@@ -18,12 +18,15 @@ class Description:
     facts : list of (what, value)
     problems : list of str
         One line each; empty if nothing is wrong.
+    doubts : list of str
+        One line each: what may be as it should.
     """
 
     path: Path
     kind: str
     facts: list[tuple[str, str]] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
 
     def fact(self, what: str, value: object) -> None:
         """Add a fact."""
@@ -31,9 +34,17 @@ class Description:
 
     def problem(self, what: object) -> None:
         """Add something that is wrong, as one line, and once."""
-        line = " ".join(str(what).split())
-        if line not in self.problems:
-            self.problems.append(line)
+        _add_line(self.problems, what)
+
+    def doubt(self, what: object) -> None:
+        """Add something that is doubtful, as one line, and once."""
+        _add_line(self.doubts, what)
+
+
+def _add_line(lines: list[str], what: object) -> None:
+    line = " ".join(str(what).split())
+    if line not in lines:
+        lines.append(line)
 
 
 def count(n: int, one: str, many: str | None = None) -> str:

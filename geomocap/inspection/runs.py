@@ -78,7 +78,7 @@ def _warnings(run: Run, told: Description) -> None:
     """Say what made the results doubtful when they were made."""
     try:
         for warning in (*read_camera_doubts(run).warnings, *read_warnings(run)):
-            told.problem(warning)
+            told.doubt(warning)
     except GeomocapError as error:
         told.problem(error)
 

@@ -58,7 +58,7 @@ def _compare(scans: Scans, surfaces: list[ScanSurface], told: Description) -> No
         told.problem(error)
         return
     for doubt in doubts:
-        told.problem(doubt)
+        told.doubt(doubt)
 
 
 def _read(scans: Scans, told: Description) -> list[ScanSurface]:

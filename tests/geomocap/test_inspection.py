@@ -195,7 +195,7 @@ def test_scans(tmp_path):
     assert facts["meshes"] == "8 vertices, 12 triangles" and "one scan" in facts["motion"]
 
 
-def test_what_a_segmentation_warns_of_or_refuses_is_wrong_with_scans(tmp_path):
+def test_what_a_segmentation_warns_of_or_refuses_is_told_of_scans(tmp_path):
     rng = np.random.default_rng(0)
     points = rng.normal(size=(4, 50, 3))
     flat, line = points * (1, 1, 0), points * (1, 0, 0)
@@ -207,20 +207,21 @@ def test_what_a_segmentation_warns_of_or_refuses_is_wrong_with_scans(tmp_path):
     for name, (found, text) in says.items():
         np.savez(tmp_path / f"{name}.npz", points=found)
         told = describe(tmp_path / f"{name}.npz")
-        assert len(told.problems) == 1 and text in told.problems[0]
+        assert len(told.problems) == (name == "axes") and text in (told.problems + told.doubts)[0]
         assert "points in common" in dict(told.facts)
     told = describe(tmp_path / "millimetres.npz", metres_per_unit=0.001)
-    assert told.problems == [] and dict(told.facts)["box around all"].endswith(" m")
+    assert told.problems == told.doubts == [] and dict(told.facts)["box around all"].endswith(" m")
 
 
-def test_what_was_doubtful_when_a_run_was_made_is_wrong_with_it(tmp_path):
+def test_what_was_doubtful_when_a_run_was_made_is_told(tmp_path):
     run = Run(tmp_path / "run")
     run.write_npz("skeleton.npz", **skeleton_arrays())
     run.write_record({"source": {"up": "z"}})
     assert describe(run.path).problems == []
     write_warnings(run, ["the scans are 824 m across"])
     write_camera_doubts(run, CameraDoubts(("cam02",), (), ("camera cam02 is mirrored",)))
-    assert describe(run.path).problems == ["camera cam02 is mirrored", "the scans are 824 m across"]
+    assert describe(run.path).doubts == ["camera cam02 is mirrored", "the scans are 824 m across"]
+    assert describe(run.path).problems == []
 
 
 def test_nothing_known(tmp_path):
