@@ -25,7 +25,7 @@ def info(
     metres_per_unit: MetresPerUnit = 1.0,
     workers: Workers = None,
 ) -> None:
-    """Say what a capture, a run, a calibration, a truth, a motion file or scans hold, what is wrong with them, and what is doubtful.
+    """Say what a capture, run, calibration, truth, motion file or scans hold, what is wrong, and what is doubtful.
 
     The exit status is 1 if something is wrong.
     """
