@@ -1,6 +1,8 @@
-"""Joint angles over time, each with its band of confidence."""
+"""Motion over time: joint angles, each with its band of confidence, turns of joints or of a single body, bones."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -8,7 +10,8 @@ from matplotlib.figure import Figure
 from geomocap.angles.angle_set import AngleSet
 from viz.body_colors import body_color, hex_color
 from viz.desk import Desk
-from viz.figures import WIDTH, figure_of, plot
+from viz.figures import WIDTH, body_motion, bone_lengths, figure_of, joint_angles, plot
+from viz.quality_figures import Bone
 from viz.report import Block, text
 from viz.run_contents import Results
 from viz.shown_angles import angles_of
@@ -64,3 +67,23 @@ def angle_blocks(results: Results, desk: Desk) -> list[Block]:
         "scatter of the surface; what the surface slides over the bones isn't in them."
     )
     return [text(found[1]), *desk.plot("angles", angle_sheet(found[0]), "Joint angles", words)]
+
+
+def motion_blocks(results: Results, bones: Sequence[Bone], desk: Desk) -> list[Block]:
+    """Return plots of how far joints, or a single body, have turned since the first frame, and of bones' lengths."""
+    skeleton = results.skeleton
+    if skeleton is None or skeleton.frame_count < 2:
+        return []
+    if not skeleton.joint_count:
+        words = "Turn and way of the whole body, as in the motion files. Smooth curves are good."
+        return desk.plot("motion", body_motion(skeleton, results.fps), "Motion since the first frame", words)
+    words = (
+        "How far each joint has turned since the first frame, in its body's colour; thin lines: the rotation "
+        "vector's parts about the parent's axes. Smooth curves are good."
+    )
+    turned = joint_angles(skeleton, results.fps)
+    blocks = desk.plot("joint_angles", turned, "Turns since the first frame", words)
+    if bones:
+        words = "Bones don't grow: what differs from zero is error of the joints."
+        blocks += desk.plot("bone_lengths", bone_lengths(bones, results.fps), "Bone lengths", words)
+    return blocks

@@ -14,6 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from geomocap.model.ellipsoids import Ellipsoids
+from geomocap.model.rotations import rotation_vectors
 from geomocap.model.skeleton import Skeleton
 from viz.body_colors import ACCENT, INK, body_color, hex_color
 from viz.drawing import DENSITY
@@ -102,6 +103,26 @@ def joint_angles(skeleton: Skeleton, fps: float | None) -> Figure:
         ax.set_ylim(-1.05 * top, 1.05 * top)
     figure.supxlabel(label, fontsize=8.5, color="#4a525c")
     figure.supylabel("rotation since the first frame (°)", fontsize=8.5, color="#4a525c")
+    return figure
+
+
+@plot
+def body_motion(skeleton: Skeleton, fps: float | None) -> Figure:
+    """Plot how far the root body has turned and moved since the first frame, and the parts along the world's axes."""
+    turned = np.rad2deg(rotation_vectors(skeleton.body_rotations[:, [skeleton.root]])[:, 0])
+    moved = 1000 * (skeleton.root_positions - skeleton.root_positions[0])
+    times, label = times_axis(skeleton.frame_count, fps)
+    figure = figure_of(WIDTH, 2.5)
+    axes = figure.subplots(1, 2)
+    name = skeleton.body_names[skeleton.root]
+    for ax, vectors, title in zip(axes, (turned, moved), ("turn (°)", "way (mm)"), strict=True):
+        for part, axis, dashes in zip(vectors.T, "xyz", ("-", "--", ":"), strict=True):
+            ax.plot(times, part, color=MUTED, lw=0.9, ls=dashes, label=axis)
+        ax.plot(times, np.linalg.norm(vectors, axis=1), color=hex_color(body_color(skeleton.root)), lw=1.8)
+        ax.set_title(f"{name}: {title}")
+        ax.set_xlabel(label)
+        _at_least(ax, 10.0)
+        ax.legend(ncols=3, loc="best", fontsize=7)
     return figure
 
 

@@ -125,7 +125,7 @@ def motion_video(
     camera = best_camera(results, stage)
     size = tile_size(stage, 0, 12, 95_000)
     size = (max(size[0], 240), size[1])
-    show_bodies = "bodies" in results.kinds or results.skeleton is None
+    show_bodies = "bodies" in results.kinds or results.skeleton is None or not results.skeleton.bones
 
     def draw(job: tuple[int, int]) -> np.ndarray:
         i, frame = job

@@ -130,7 +130,7 @@ def bones(skeleton: Skeleton) -> list[Bone]:
         start = skeleton.body_positions[:, body] if joint < 0 else skeleton.joint_positions[:, joint]
         lengths = np.linalg.norm(skeleton.joint_positions[:, child] - start, axis=1)
         if np.isfinite(lengths).any():
-            first = f"body {body}" if joint < 0 else skeleton.joint_names[joint]
+            first = skeleton.body_names[body] if joint < 0 else skeleton.joint_names[joint]
             result.append(Bone(f"{first} – {skeleton.joint_names[child]}", body, lengths))
     return result
 
@@ -282,7 +282,7 @@ def warnings(results: Results, quality: Quality) -> list[str]:
             f"{len(varying)} of {len(quality.bones)} bones change their length by more than 10 % "
             f"(most: {worst.name}, {100 * worst.spread / worst.mean:.0f} %); their joints slide or jump."
         )
-    if skeleton is not None and quality.jitter is not None:
+    if skeleton is not None and skeleton.joint_count and quality.jitter is not None:
         span = float(np.linalg.norm(np.ptp(skeleton.joint_positions[0], axis=0)))
         restless = [n for n, j in zip(skeleton.joint_names, quality.jitter, strict=True) if j > 0.02 * span]
         if restless:

@@ -15,7 +15,7 @@ from geomocap.files.run import Run
 from geomocap.progress import Progress, silent
 from viz import figures, keypoint_plots, separation, sheets
 from viz import track_pictures as tracks
-from viz.angle_plots import angle_blocks
+from viz.angle_plots import angle_blocks, motion_blocks
 from viz.desk import Desk
 from viz.films import filmed_beside
 from viz.keypoint_marks import marks_of_run
@@ -325,7 +325,9 @@ def _separation(results: Results, stage: ViewStage | None, desk: Desk) -> list[B
         blocks += desk.plot("elimination", curve, "Number of bodies", words)
     if found.reliability is not None and found.reliability.shape[1] > 0:
         words = "Dark: the body was hardly measured there, and its motion is bridged from its neighbours and in time."
-        blocks += desk.plot("reliability", separation.reliability(found.reliability, results.fps), "Measured", words)
+        names = [results.body_name(b) for b in range(found.reliability.shape[1])]
+        drawn = separation.reliability(found.reliability, names, results.fps)
+        blocks += desk.plot("reliability", drawn, "Measured", words)
     return blocks
 
 
@@ -334,6 +336,8 @@ def _skeleton(
 ) -> list[Block]:
     if stage is None or results.skeleton is None:
         return [missing("The run has no skeleton.")]
+    if not results.skeleton.joint_count:
+        return [text("The subject is one rigid body, so it has no joints."), *motion_blocks(results, [], desk)]
     words = (
         "The skeleton inside the translucent volume. Joints should sit where limbs bend, in the middle of the flesh."
     )
@@ -347,17 +351,7 @@ def _skeleton(
     if kinds := separation.joints_table(results):
         blocks.append(kinds)
     if len(results.skeleton.joint_positions) > 1:
-        blocks += angle_blocks(results, desk)
-        words = (
-            "How far each joint has turned since the first frame, in its body's colour; thin lines: the rotation "
-            "vector's parts about the parent's axes. Smooth curves are good."
-        )
-        turned = figures.joint_angles(results.skeleton, results.fps)
-        blocks += desk.plot("joint_angles", turned, "Turns since the first frame", words)
-        if quality.bones:
-            words = "Bones don't grow: what differs from zero is error of the joints."
-            lengths = figures.bone_lengths(quality.bones, results.fps)
-            blocks += desk.plot("bone_lengths", lengths, "Bone lengths", words)
+        blocks += [*angle_blocks(results, desk), *motion_blocks(results, quality.bones, desk)]
     return blocks
 
 

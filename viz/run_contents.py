@@ -32,7 +32,7 @@ from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.ellipsoids import Ellipsoids
 from geomocap.model.frame_geometry import BodyPoints, Voxels
 from geomocap.model.keypoint_paths import KeyPoints
-from geomocap.model.skeleton import Skeleton
+from geomocap.model.skeleton import Skeleton, body_names
 from geomocap.model.trajectories import Tracks
 from viz.kept_values import KeptValues
 
@@ -150,13 +150,18 @@ class Results:
 
     @cached_property
     def skeleton(self) -> Skeleton | None:
-        """The skeleton, if it is there and holds a joint."""
+        """The skeleton, if it is there; that of a single rigid body has no joints."""
         found = read_skeleton(self.run) if self.run.has(SKELETON) else None
-        if found is None or not found.joint_count or self.names is None:
-            return None if found is None or not found.joint_count else found
+        if found is None or self.names is None:
+            return found
         bodies = self.names.body_names(found.body_count, found.body_names)
         joints = self.names.joint_names(found.joint_bodies, bodies, found.joint_names)
         return replace(found, body_names=np.array(bodies), joint_names=np.array(joints))
+
+    def body_name(self, body: int) -> str:
+        """Return what a body is called, also where no skeleton says it."""
+        s = self.skeleton
+        return str(s.body_names[body]) if s is not None and body < s.body_count else str(body_names(body + 1)[body])
 
     @cached_property
     def tracks(self) -> Tracks | None:

@@ -43,13 +43,25 @@ def lead(results: Results) -> str:
     else:
         source = "a sequence of geometry" if len(results.frames) > 1 else "a scan"
     e, s = results.ellipsoids, results.skeleton
-    if s is not None:
-        return f"From {source} to {s.body_count} rigid bodies and {len(s.joint_names)} joints, without a body model."
-    if e is not None and e.body_count:
-        return f"From {source} to {e.body_count} rigid bodies, without a body model."
+    if s is not None and s.joint_count:
+        found = f"{_counted(s.body_count, 'rigid bodies')} and {_counted(s.joint_count, 'joints')}"
+        return f"From {source} to {found}, without a body model."
+    if bodies := s.body_count if s is not None else e.body_count if e is not None else 0:
+        return f"From {source} to {_counted(bodies, 'rigid bodies')}, without a body model."
     if e is not None:
-        return f"From {source} to {e.centers.shape[1]} ellipsoids."
+        return f"From {source} to {_counted(e.centers.shape[1], 'ellipsoids')}."
     return f"What has been made from {source} so far."
+
+
+def _pair(number: int, things: str) -> tuple[str, str]:
+    """Return a number and what it counts, which is given in the plural."""
+    if number == 1:
+        things = f"{things[:-3]}y" if things.endswith("ies") else things[:-1]
+    return str(number), things
+
+
+def _counted(number: int, things: str) -> str:
+    return " ".join(_pair(number, things))
 
 
 def key_figures(results: Results) -> tuple[tuple[str, str], ...]:
@@ -66,11 +78,11 @@ def key_figures(results: Results) -> tuple[tuple[str, str], ...]:
             label = "surface voxels a frame" if kind == "voxels" else "points a frame"
             figures.append((f"{round(float(results.counts[kind].mean())):,}", label))
     if results.ellipsoids is not None:
-        figures.append((str(results.ellipsoids.centers.shape[1]), "ellipsoids"))
+        figures.append(_pair(results.ellipsoids.centers.shape[1], "ellipsoids"))
         if results.ellipsoids.body_count:
-            figures.append((str(results.ellipsoids.body_count), "bodies"))
-    if results.skeleton is not None:
-        figures.append((str(len(results.skeleton.joint_names)), "joints"))
+            figures.append(_pair(results.ellipsoids.body_count, "bodies"))
+    if results.skeleton is not None and results.skeleton.joint_count:
+        figures.append(_pair(results.skeleton.joint_count, "joints"))
     timings = results.run.read_timings()
     if timings:
         figures.append((f"{sum(float(t['seconds']) for t in timings.values()):.1f} s", "of work"))
@@ -121,18 +133,10 @@ def bodies_table(results: Results, frame: int) -> Block:
         if s is not None and body >= 0:
             joints = ", ".join(s.joint_names[j] for j in np.flatnonzero((s.joint_bodies == body).any(axis=1)).tolist())
         confidence = "" if sure is None or not 0 <= body < len(sure) else f"{sure[body]:.2f}"
-        rows.append((_called(results, body), fraction, confidence, own, joints))
+        rows.append((results.body_name(body) if body >= 0 else "none", fraction, confidence, own, joints))
         colors.append(hex_color(body_color(body)))
     head = ("body", f"points in frame {frame} (%)", "confidence", "ellipsoids", "joints")
     return table(head, rows, (1, 2, 3), colors)
-
-
-def _called(results: Results, body: int) -> str:
-    """Return what a body is called in the report's tables."""
-    s = results.skeleton
-    if body < 0 or s is None or body >= s.body_count or results.names is None:
-        return f"body {body}" if body >= 0 else "none"
-    return str(s.body_names[body])
 
 
 def summary(quality: Quality) -> list[Block]:

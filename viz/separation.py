@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from viz.body_colors import ACCENT, INK, body_color, body_colors, hex_color
 from viz.drawing import sheet
@@ -39,7 +39,7 @@ def elimination_curve(bodies: np.ndarray, strengths: np.ndarray, found: int) -> 
 
 
 @plot
-def reliability(fraction: np.ndarray, fps: float | None) -> Figure:
+def reliability(fraction: np.ndarray, names: Sequence[str], fps: float | None) -> Figure:
     """Plot the fraction of each body's samples that were measured and follow it, (T, B), over time."""
     figure = figure_of(WIDTH, min(0.9 + 0.13 * fraction.shape[1], 6.0))
     ax = figure.subplots()
@@ -49,8 +49,8 @@ def reliability(fraction: np.ndarray, fps: float | None) -> Figure:
     )
     ax.grid(visible=False)
     ax.set_xlabel("time (s)" if fps else "frame")
-    ax.set_ylabel("body")
-    ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+    step = -(-len(names) // 40)  # so many names find room beside each other
+    ax.set_yticks(range(0, len(names), step), names[::step], fontsize=6.5)
     ax.set_title("fraction of a body's samples that are measured and follow it")
     figure.colorbar(image, ax=ax, pad=0.01)
     return figure
@@ -92,7 +92,7 @@ def joints_table(results: Results) -> Block | None:
     """Return the table of joints: ball or hinge, its axis at rest, standard deviation; None where it isn't known."""
     found, skeleton = results.diagnostics, results.skeleton
     kinds, axes = found.joint_is_hinge, found.joint_axes
-    if skeleton is None or kinds is None or axes is None or len(kinds) != skeleton.joint_count:
+    if skeleton is None or kinds is None or axes is None or not len(kinds) == skeleton.joint_count > 0:
         return None
     deviations = found.joint_std  # joints of a known subject's model have none
     called = skeleton.body_names

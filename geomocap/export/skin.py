@@ -12,6 +12,7 @@ from geomocap.export.motion_tree import MotionTree
 from geomocap.export.skinned_mesh import INFLUENCES, SkinnedMesh
 from geomocap.files.frame_files import read_points, read_voxels
 from geomocap.files.run import Run
+from geomocap.model.skeleton import body_names
 from geomocap.model.surface import Surface, surface_through
 
 VOTERS = 15  # points that say which body a vertex belongs to
@@ -130,7 +131,8 @@ def node_of_body(motion: MotionTree, bodies: np.ndarray) -> np.ndarray:
     table[motion.bodies[motion.bodies >= 0]] = np.flatnonzero(motion.bodies >= 0)
     nodes = table[bodies]
     if (nodes < 0).any():
-        raise MotionError(f"skin: body {int(bodies[nodes < 0][0])} has points but no place in skeleton.npz; run again")
+        lost = body_names(int(bodies.max()) + 1)[bodies[nodes < 0][0]]
+        raise MotionError(f"skin: {lost} has points but no place in skeleton.npz; run again")
     return nodes
 
 

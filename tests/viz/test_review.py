@@ -127,7 +127,7 @@ def test_cameras_that_contradict_and_names_are_told(made: Made, tmp_path: Path) 
     told = bodies_table(results, 0)
     assert told.rows[7][0] == "left_shin" and "left_knee" in told.rows[7][-1]
     (run.path / "names.toml").write_text('"no name" = 7\n')
-    assert bodies_table(named(Results(run, made.capture)), 0).rows[7][0] == "body 7"
+    assert bodies_table(named(Results(run, made.capture)), 0).rows[7][0] == "body07"
     write_camera_doubts(run, CameraDoubts(("cam1",), ("cam1",), (word,)))
     (block,) = camera_remarks(Results(run, made.capture))
     assert "without cam1" in block.items[-1]
