@@ -108,9 +108,19 @@ def check_settings(model: type[Model], values: dict[str, Any], where: str = "") 
         key = shortened(".".join(str(p) for p in first["loc"]))
         start = f"{where}: " if where else ""
         if first["type"] == "extra_forbidden":
-            raise SettingsError(f"{start}unknown setting {key}; docs/settings.md lists them all") from None
+            known = ", ".join(_table(model, first["loc"]).model_fields)
+            raise SettingsError(f"{start}unknown setting {key}; known there are {known}") from None
         given = f"setting {key} = {shortened(repr(first['input']))}: " if key else ""
         raise SettingsError(f"{start}{given}{_plain(first['msg'])}") from None
+
+
+def _table(model: type[BaseModel], place: tuple[int | str, ...]) -> type[BaseModel]:
+    """Return the model of the table, or of the tables in a list, that a key stands in."""
+    for part in place[:-1]:
+        if part in model.model_fields:
+            parts = _types(model.model_fields[str(part)].annotation)
+            model = next((t for t in parts if isinstance(t, type) and issubclass(t, BaseModel)), model)
+    return model
 
 
 def explained(error: ValidationError) -> str:

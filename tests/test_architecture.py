@@ -47,7 +47,7 @@ ROOMS: dict[str, set[str]] = {
     "angles": VALUES | {"naming", "skeleton"},
     "export": VALUES | {"angles", "files", "naming", "skeleton", "subject", "version"},
     "evaluation": VALUES | {"carving", "files", "silhouettes", "export", "skeleton", "subject"},
-    "inspection": VALUES | {"files", "export", "evaluation", "subject"},
+    "inspection": VALUES | {"dense", "files", "export", "evaluation", "subject"},
 }
 # names of version 0.1.0, which are to go
 ROOMS["cameras"] = ROOMS["geometry"] = {"files", "model"}

@@ -230,6 +230,7 @@ def calibrate_bar(
     adjusted, tests = choose_model(found.adjusted, prior, settings)
     progress("calibrate", 3, steps)
     datum = world.datum(adjusted, found.target_radius)
+    datum = replace(datum, warnings=datum.warnings + world.doubts(observations.frames))
     adjusted = replace(adjusted, network=datum.apply(adjusted.network))
     cov = covariance(adjusted)
     lengths = held_out(adjusted, settings.folds)

@@ -22,11 +22,13 @@ from geomocap.reading import check_name, list_folder, read_toml
 from geomocap.scheduling import map_items, threads
 from geomocap.settings import Settings, explained
 
+LEAST_LENGTH, MOST_LENGTH = 1e-3, 20.0  # of a bar, metres
+
 
 class BarInfo(Settings):
     """What `bar/bar.toml` says."""
 
-    length: float = Field(gt=0, lt=20, description="distance of the two target centres (m)")
+    length: float = Field(gt=0, lt=MOST_LENGTH, description="distance of the two target centres (m)")
     length_sigma: float | None = Field(None, gt=0, description="its standard deviation (m)")
     target_radius: float | None = Field(None, gt=0, description="radius of the balls (m); measured if not given")
     floor: tuple[int, ...] = Field((), description="frames in which the bar lies on the floor")
@@ -108,13 +110,24 @@ class Recording:
 
 def read_bar_info(file: Path, length: float | None = None) -> BarInfo:
     """Read and check `bar.toml`; a given length goes before the file's, and makes do without the file."""
+    if length is not None:
+        check_length(length)
     values: dict[str, Any] = {}
     if file.exists() or length is None:
         values = read_toml(file, CaptureError, "it must say `length = …`, metres between the target centres")
     try:
         return BarInfo(**{**values, **({"length": length} if length is not None else {})})
     except ValidationError as error:
-        raise CaptureError(f"{file}: {explained(error)}") from None
+        raise CaptureError(f"{file}: {explained(error)}; lengths are in metres") from None
+
+
+def check_length(length: float) -> None:
+    """Refuse what is no length of a bar, metres, that was given instead of the file's."""
+    if not LEAST_LENGTH <= length < MOST_LENGTH:
+        raise CaptureError(
+            f"--distance {length:g}: expected the distance of the bar's two target centres in metres, "
+            f"{LEAST_LENGTH:g} to {MOST_LENGTH:g}"
+        )
 
 
 def measure(

@@ -63,3 +63,14 @@ class WorldKnowledge:
         if self.gravity is not None:
             return datum_from_gravity(network, self.gravity[0], np.array(self.gravity[1]), self.up)
         return datum_from_cameras(network, self.up)
+
+    def doubts(self, frames: np.ndarray) -> tuple[str, ...]:
+        """Return what of this can't be meant, in words, for a recording with these frame numbers, (T,) int."""
+        absent = sorted(set(self.floor) - set(frames.tolist()))
+        if not absent:
+            return ()
+        there = f"{len(frames)} frames, {frames.min()} to {frames.max()}"
+        return (
+            f"floor: {len(absent)} of the {len(set(self.floor))} frames named, {absent[0]} to {absent[-1]}, are not in "
+            f"the recording, which has {there}; name only those in which the bar lies on the floor",
+        )

@@ -14,7 +14,7 @@ from geomocap.calibration.bar_calibration import Calibration, calibrate_bar, che
 from geomocap.calibration.calibration_settings import BarSettings
 from geomocap.calibration.from_capture import calibrate_capture, up_of, with_l_shape, with_points
 from geomocap.calibration.observed_points import observations_of, read_observed
-from geomocap.calibration.recording import Recording
+from geomocap.calibration.recording import Recording, check_length
 from geomocap.calibration.world import WorldKnowledge
 from geomocap.cli.arguments import CaptureFolder, Workers
 from geomocap.cli.console import console
@@ -34,7 +34,7 @@ def calibrate(
     settings: BarSettings,
     distance: Annotated[
         float | None,
-        typer.Option("--distance", min=1e-3, help="Length of the bar between the target centres (m); else bar.toml's."),
+        typer.Option("--distance", help="Length of the bar between the target centres (m); else bar.toml's."),
     ] = None,
     points: Annotated[
         Path | None,
@@ -81,6 +81,8 @@ def calibrate(
 
     Example: `geomocap calibrate studio --distance 0.5 --floor 0-5`
     """
+    if distance is not None:
+        check_length(distance)
     if ends and points is None:
         raise CalibrationError("--ends names points of a table; give it by --points")
     check_replaceable(capture / "sparse", force)

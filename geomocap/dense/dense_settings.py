@@ -76,7 +76,7 @@ class CloudSettings(Settings):
     spacing: float | None = Field(
         None,
         gt=0,
-        description="distance of neighbouring points on the surface, instead of growing.step (m)",
+        description="distance of neighbouring points on the surface, instead of cloud.growing.step (m)",
         json_schema_extra={"flag": "cloud-spacing"},
     )
     least_views: int = Field(2, ge=2, description="cameras that have to see a point, the template included")

@@ -117,15 +117,24 @@ def match_groups(rig: Rig, settings: GroupSettings | None = None, box: Box | Non
             depth = float((center - rig.centers[t]) @ rig.viewing_directions[t])
             groups.append(MatchGroup(t, searches, T, depth, near * depth, far * depth))
     if not groups:
-        off = angles[~np.eye(len(rig), dtype=bool)]
-        raise CalibrationError(
-            f"no two cameras can be matched: their viewing directions differ by "
-            f"{off.min(initial=180):.0f}° at least, expected {settings.least_angle:g}° to "
-            f"{settings.greatest_angle:g}°; widen groups.least_angle and groups.greatest_angle or add cameras between"
-        )
+        raise CalibrationError(_unmatched(angles[np.triu_indices(len(rig), 1)], settings))
     maps = tuple(None if c.is_undistorted() else rig.undistortion_map(i) for i, c in enumerate(rig.cameras))
     count = max(sum(g.template in templates for g in groups), 1)
     return MatchGroups(pinhole, maps, tuple(groups[:count]), tuple(groups[count:]))
+
+
+def _unmatched(angles: np.ndarray, settings: GroupSettings) -> str:
+    """Say that no two cameras can be matched, and which setting keeps them from it."""
+    low, high = angles.min(initial=180), angles.max(initial=0)
+    span = f"{low:.0f}°" if len(angles) < 2 else f"{low:.0f}° to {high:.0f}°"
+    if high < settings.least_angle:
+        mend = "reduce cloud.groups.least_angle or place cameras further apart"
+    else:
+        mend = "enlarge cloud.groups.greatest_angle or add cameras between"
+    return (
+        f"no two cameras can be matched: their viewing directions differ by {span}, expected "
+        f"{settings.least_angle:g}° to {settings.greatest_angle:g}°; {mend}"
+    )
 
 
 def too_far_apart(rig: Rig, settings: GroupSettings, box: Box | None = None) -> bool:

@@ -363,7 +363,7 @@ def read_capture_info(path: Path) -> CaptureInfo:
     try:
         return CaptureInfo(**read_toml(file, CaptureError, "a capture needs at least `fps = …` in it"))
     except ValidationError as error:
-        raise CaptureError(f"{file}: {explained(error)}; see README, section Captures") from None
+        raise CaptureError(f"{file}: {explained(error)}; see docs/captures.md") from None
 
 
 def write_capture_info(path: Path, info: CaptureInfo) -> None:

@@ -7,6 +7,7 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
+from geomocap.dense.match_groups import match_groups
 from geomocap.errors import GeomocapError
 from geomocap.evaluation.camera_check import check_cameras_of
 from geomocap.files.capture import Capture
@@ -14,6 +15,7 @@ from geomocap.files.images import ImageFolder, image_size, size_text
 from geomocap.inspection.calibrations import describe_rig
 from geomocap.inspection.description import Description, count, shortened
 
+FEWEST_CAMERAS = 2  # their surface is matched in their images, which can't be done from any directions
 MOST_NAMED = 3  # files of one camera that are wrong
 
 
@@ -58,6 +60,8 @@ def _judge_parts(capture: Capture, plates: list[str], told: Description) -> None
     else:
         try:
             describe_rig(capture.rig, told)
+            if len(capture.rig) == FEWEST_CAMERAS:
+                match_groups(capture.rig, box=capture.info.region_of_interest)
         except GeomocapError as error:
             told.problem(error)
     if 0 < len(plates) < len(capture.cameras):

@@ -60,6 +60,8 @@ def test_options_that_are_refused(points: Path, tmp_path: Path) -> None:
         (("--points", points, "--distance", "0.5", "--floor", "a-b"), "expected frame numbers"),
         (("--points", points, "--distance", "0.5", "--ends", "0"), "two point names"),
         (("--points", points, "--distance", "0.5", "--gravity", "a:1,2"), "CAMERA:X,Y,Z"),
+        (("--points", points, "--distance", "500"), r"--distance 500: .* in metres, 0\.001 to 20"),
+        (("--distance", "500"), r"--distance 500: .* in metres, 0\.001 to 20"),
         ((), "no bar recording"),
     ):
         with pytest.raises(GeomocapError, match=words):

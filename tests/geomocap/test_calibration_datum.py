@@ -50,6 +50,9 @@ def test_floor_bars() -> None:
     bars = TRUE.bars.copy()
     bars[:3, :, 2] = 0.03  # balls of 3 cm on the floor
     floor = replace(TRUE, bars=bars)
+    assert WorldKnowledge(floor=(0, 1, 2)).doubts(np.arange(20)) == ()
+    (told,) = WorldKnowledge(floor=tuple(range(101))).doubts(np.arange(20))
+    assert "81 of the 101 frames named, 20 to 100, are not in the recording, which has 20 frames, 0 to 19" in told
     lost = floor.transformed(TURN, np.array([0.3, 2.0, -1.0]))
     found = d.datum_from_floor(lost, (0, 1, 2), "z", 0.03)
     moved = found.apply(lost)

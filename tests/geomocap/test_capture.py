@@ -201,7 +201,7 @@ def test_a_turned_photograph_has_the_size_as_it_is_read(tmp_path):
     [
         ("fps = -3", "fps: must be greater than"),
         ("name = 'x'", "fps: is missing"),
-        ("fps = 30\nspeed = 3", "speed: no such key"),
+        ("fps = 30\nspeed = 3", r"speed: no such key; see docs/captures\.md"),
         ("fps = ", "not valid TOML"),
         ("fps = 30\nup = 'x'", "up: must be 'y' or 'z'"),
         ("fps = 30\ncameras = ['cam1', 'cam1']", "cameras: camera cam1 is there more than once"),

@@ -25,7 +25,8 @@ def test_run_toml_is_a_settings_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[carving]\nresolutoin = 3", r"a\.toml: unknown setting carving\.resolutoin"),
+        ("[carving]\nresolutoin = 3", r"a\.toml: unknown setting carving\.resolutoin; known there are resol"),
+        ("[cloud.merge]\nspan = 3", r"unknown setting cloud\.merge\.span; known there are distance, support$"),
         ("[carving]\nresolution = 'big'", r"setting carving\.resolution = 'big': must be a valid integer"),
         ("[carving]\nresolution = true", r"carving\.resolution = True: must be a number, not true or false"),
         ("[scans]\nscale = true", r"scans\.scale = True: must be a number"),

@@ -223,8 +223,10 @@ def test_groups_take_neighbours_on_both_sides() -> None:
 
 
 def test_groups_that_can_t_be() -> None:
-    with pytest.raises(CalibrationError, match="no two cameras"):
+    with pytest.raises(CalibrationError, match=r"by 180°, .* 6° to 60°; enlarge cloud\.groups\.greatest_angle or"):
         match_groups(ring(2, 180))
+    with pytest.raises(CalibrationError, match=r"by \d+°, .*; reduce cloud\.groups\.least_angle or"):
+        match_groups(ring(2, 15), GroupSettings(least_angle=30, best_angle=40))
     with pytest.raises(CalibrationError, match="no two cameras"):
         match_groups(ring(3, 360))
     with pytest.raises(CalibrationError, match="camX"):

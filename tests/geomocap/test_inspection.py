@@ -58,6 +58,13 @@ def test_a_capture_without_and_with_calibration(capture):
     assert "focal length 60.0 px (56° across)" in said["a"]
 
 
+def test_two_cameras_that_can_not_be_matched_are_told(capture):
+    write_rig(capture / "sparse", two_cameras())
+    (capture / "capture.toml").write_text('fps = 15.0\ncameras = ["a", "b"]\n')
+    (problem,) = describe(capture).problems
+    assert problem.startswith("no two cameras can be matched") and "cloud.groups.greatest_angle" in problem
+
+
 def test_a_capture_with_problems(capture):
     write_rig(capture / "sparse", two_cameras(away=True))
     (capture / "images" / "b" / "000002.png").write_bytes(b"")
