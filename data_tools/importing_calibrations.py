@@ -23,9 +23,10 @@ from geomocap.files.rigs import write_rig
 from geomocap.files.videos import VIDEO_ENDINGS, Video
 from geomocap.model.rig import Rig
 
-Format = Literal["aniposelib", "caliscope", "pose2sim", "opencv", "easymocap", "colmap"]
+Format = Literal["anipose", "aniposelib", "caliscope", "pose2sim", "opencv", "easymocap", "colmap"]
 
 WRITERS: dict[str, Callable[[Rig, Path], None]] = {
+    "anipose": write_aniposelib,  # the tool, and its library that has the format
     "aniposelib": write_aniposelib,
     "caliscope": write_caliscope,
     "pose2sim": write_pose2sim,

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import subprocess
 import sys
+import textwrap
 import tomllib
 from importlib.util import find_spec
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -15,7 +18,9 @@ from pydantic import BaseModel
 
 import geomocap
 from geomocap.cli.app import COMMANDS
+from geomocap.cli.capture_commands import convert, import_
 from geomocap.config import Config
+from geomocap.keypoints.keypoint_regions import read_keypoints
 from tests.benchmarks.quality import row
 from tests.geomocap.moving_chains import chain
 from tools.result_tables import ROOT, measured_now, read_table, read_tables
@@ -96,6 +101,26 @@ def test_commands_that_pages_name_are_there_and_all_are_named():
     for page in PAGES:
         named |= set(re.findall(r"(?:^ {4}(?:\.venv/bin/)?|`)geomocap ([a-z][a-z-]+)", page.read_text(), re.MULTILINE))
     assert named == set(COMMANDS)
+
+
+def test_kinds_and_formats_of_calibrations_that_the_page_lists_are_those_of_the_commands():
+    page = (ROOT / "docs" / "calibration.md").read_text().partition("## Calibrations of other tools")[2]
+    table, _, formats = page.partition("`--format` is")
+    cells = [row.split("|")[1] for row in table.splitlines() if row.startswith("| `")]
+    kinds, written = (
+        set(get_args(get_args(inspect.signature(f, eval_str=True).parameters["kind"].annotation)[0]))
+        for f in (import_, convert)
+    )
+    assert set(re.findall(r"`(\w+)`", " ".join(cells))) == kinds
+    assert set(re.findall(r"`(\w+)`", formats.partition("\n\n")[0])) == written
+    assert written <= kinds
+
+
+def test_key_points_of_the_page_can_be_read(tmp_path):
+    page = (ROOT / "docs" / "keypoints.md").read_text()
+    example = page[page.index("    links") : page.index("    geomocap keypoints RUN")]
+    (tmp_path / "keypoints.toml").write_text(textwrap.dedent(example))
+    assert read_keypoints(tmp_path / "keypoints.toml").names == ["hand", "elbow"]
 
 
 def test_the_readme_is_short():

@@ -57,8 +57,10 @@ def synthesize(
 @with_file_of_options
 def import_(
     kind: Annotated[
-        Literal["pose2sim", "colmap", "anipose", "caliscope", "opencv", "easymocap", "qualisys"],
-        typer.Argument(metavar="KIND", help="pose2sim, colmap, anipose, caliscope, opencv, easymocap or qualisys."),
+        Literal["pose2sim", "colmap", "anipose", "aniposelib", "caliscope", "opencv", "easymocap", "qualisys"],
+        typer.Argument(
+            metavar="KIND", help="pose2sim, colmap, anipose (or aniposelib), caliscope, opencv, easymocap or qualisys."
+        ),
     ],
     source: Annotated[Path, typer.Argument(metavar="SOURCE", help="The other tool's folder, or its calibration.")],
     capture: CaptureFolder,
