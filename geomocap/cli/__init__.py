@@ -10,10 +10,11 @@ GARBAGE = 100_000  # objects made before those not needed are looked for: compil
 
 
 def main() -> None:
-    """Run the command line; a mistake of the user's ends with one clear line and exit status 1."""
+    """Run the command line; a mistake ends with one clear line and exit status 1, 2 if the command line is wrong."""
     from geomocap.cli.app import app
     from geomocap.cli.error_stream import own_lines_only
     from geomocap.cli.interruption import interruptible
+    from geomocap.cli.usage import UsageError
     from geomocap.errors import GeomocapError
     from geomocap.reading import reason
 
@@ -22,6 +23,8 @@ def main() -> None:
     try:
         with interruptible(), own_lines_only():
             app()
+    except UsageError as error:
+        _fail(str(error), 2)
     except GeomocapError as error:
         _fail(str(error))
     except OSError as error:
@@ -35,11 +38,11 @@ def main() -> None:
         sys.exit(130)
 
 
-def _fail(text: str) -> None:
-    """Say in one line what is wrong, whatever characters its names have, and end with exit status 1."""
+def _fail(text: str, status: int = 1) -> None:
+    """Say in one line what is wrong, whatever characters its names have, and end with an exit status."""
     from geomocap.reading import harmless
 
     line = harmless(" ".join(text.split()))
     encoding = sys.stderr.encoding or "utf-8"
     print("geomocap: " + line.encode(encoding, "backslashreplace").decode(encoding), file=sys.stderr)  # noqa: T201
-    sys.exit(1)
+    sys.exit(status)

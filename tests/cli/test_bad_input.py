@@ -24,6 +24,37 @@ def refused(result) -> str:
     return last_line(result)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["run", "a", "b", "--fpx", "3"], "no such option: --fpx; try `geomocap run --help`"),
+        (["run", "a"], "missing argument 'RUN'; try `geomocap run --help`"),
+        (["run", "a", "b", "--workers"], "option '--workers' requires an argument; try `geomocap run --help`"),
+        (
+            ["segment", "a", "b", "--fps", "0"],
+            "'--fps': must be greater than or equal to 0.001; try `geomocap segment --h",
+        ),
+        (
+            ["run", "a", "b", "--source", "clouds"],
+            "'clouds' is not one of 'voxels', 'cloud'; try `geomocap run --help`",
+        ),
+        (["walk"], "no such command 'walk'; try `geomocap --help`"),
+        (["--walk"], "no such option: --walk; try `geomocap --help`"),
+    ],
+)
+def test_wrong_usage_is_said_in_one_line(geomocap, arguments, said):
+    result = geomocap(*arguments, check=False)
+    assert result.returncode == 2
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("geomocap: ") and said in line
+
+
+def test_help_and_version_are_no_mistakes(geomocap):
+    for arguments in (["--version"], ["--help"], ["run", "--help"]):
+        assert geomocap(*arguments).stderr == ""
+    assert geomocap(check=False).returncode == 2  # no command: the help is told
+
+
 def test_missing_capture(geomocap, tmp_path):
     assert "no such capture folder" in refused(geomocap("run", tmp_path / "none", tmp_path / "run", check=False))
 
