@@ -156,7 +156,7 @@ def test_frames_and_points_that_make_no_skin(arm_run):
         surface_through(np.eye(3))
     with pytest.raises(GeometryError, match="all points coincide"):
         point_spacing(np.zeros((60, 3)))
-    with pytest.raises(MotionError, match="body 7 has points but no place"):
+    with pytest.raises(MotionError, match="body07 has points but no place"):
         node_of_body(motion, np.array([0, 1, 7]))
 
 
