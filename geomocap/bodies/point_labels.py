@@ -28,10 +28,10 @@ class Voters:
 
     Attributes
     ----------
-    positions : (V, T, 3) float, metres, world
+    positions : (V, T, 3) float32, metres, world
         NaN where a point is not there.
-    trust : (V, T) float
-        How much its vote counts in a frame.
+    seen : (V, T) bool
+        Where it was measured, not filled in; its vote counts less elsewhere.
     weights : (V, B) float
         Skin weights.
     rotations, translations
@@ -45,7 +45,7 @@ class Voters:
     """
 
     positions: np.ndarray
-    trust: np.ndarray
+    seen: np.ndarray
     weights: np.ndarray
     rotations: np.ndarray
     translations: np.ndarray
@@ -55,9 +55,8 @@ class Voters:
 
     @classmethod
     def of(cls, bodies: MotionBodies, paths: MotionPaths) -> Voters:
-        """The samples from which bodies were found; those that are not seen in a frame vote less there."""
-        trust = np.where(paths.seen, 1.0, _UNSEEN)
-        return cls._of(bodies, bodies.positions, trust, bodies.weights, bodies.rest, bodies.label)
+        """The samples from which bodies were found."""
+        return cls._of(bodies, bodies.positions, paths.seen, bodies.weights, bodies.rest, bodies.label)
 
     @classmethod
     def with_tracks(
@@ -66,11 +65,10 @@ class Voters:
         """The samples, and tracks (N, T, 3), NaN where unseen, of bodies (N,) int, −1: none, at `rest` in frame 0."""
         some = np.flatnonzero(labels >= 0)
         own = np.eye(bodies.body_count)[labels[some]]
-        trust = np.where(paths.seen, 1.0, _UNSEEN)
         return cls._of(
             bodies,
-            np.concatenate([bodies.positions, tracks[some]]),
-            np.concatenate([trust, np.ones((len(some), trust.shape[1]))]),
+            np.concatenate([bodies.positions, tracks[some]], dtype=np.float32),
+            np.concatenate([paths.seen, np.isfinite(tracks[some, :, 0])]),
             np.concatenate([bodies.weights, own]),
             np.concatenate([bodies.rest, rest[some]]),
             np.concatenate([bodies.label, labels[some]]),
@@ -81,7 +79,7 @@ class Voters:
         cls,
         bodies: MotionBodies,
         positions: np.ndarray,
-        trust: np.ndarray,
+        seen: np.ndarray,
         weights: np.ndarray,
         rest: np.ndarray,
         label: np.ndarray,
@@ -90,16 +88,18 @@ class Voters:
         shapes = tuple(PointGrid.of(rest[label == b]) for b in range(bodies.body_count))
         planes = [shape.query(shape.data, min(_PLANE, shape.n))[1].reshape(shape.n, -1) for shape in shapes]
         normals = tuple(plane_normals(shape.data, near) for shape, near in zip(shapes, planes, strict=True))
-        return cls(positions, trust, weights, bodies.rotations, bodies.translations, shapes, normals, spacing)
+        positions = positions.astype(np.float32, copy=False)
+        return cls(positions, seen, weights, bodies.rotations, bodies.translations, shapes, normals, spacing)
 
     def votes(self, frame: int, points: np.ndarray) -> np.ndarray:
         """Votes for the body of each point (M, 3) of a frame, by those nearest to it: (M, B), rows sum to 1."""
         there = np.flatnonzero(np.isfinite(self.positions[:, frame, 0]))
-        grid = PointGrid.of(self.positions[there, frame])
+        grid = PointGrid.of(self.positions[there, frame].astype(float))
         voters = min(_VOTERS, grid.n)
         distances, nearest = grid.query(points, voters)
         distances, nearest = distances.reshape(len(points), voters), nearest.reshape(len(points), voters)
-        votes = self.trust[there, frame][nearest] / (distances**2 + (0.5 * self.spacing) ** 2)
+        trust = np.where(self.seen[there, frame], 1.0, _UNSEEN)
+        votes = trust[nearest] / (distances**2 + (0.5 * self.spacing) ** 2)
         rows = np.arange(0, votes.size + 1, voters)
         score = csr_matrix((votes.ravel(), nearest.ravel(), rows), (len(points), grid.n)) @ self.weights[there]
         return score / score.sum(axis=1, keepdims=True)

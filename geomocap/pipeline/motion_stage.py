@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geomocap.bodies.point_labels import Voters, label_points
 from geomocap.files.corrected_cameras import camera_warnings
 from geomocap.files.results import write_diagnostics, write_ellipsoids, write_points, write_skeleton, write_warnings
 from geomocap.files.run import Run
@@ -75,7 +76,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     axes = np.array([joint.axis for joint in found.joints]).reshape(-1, 3)
     fit = None if isinstance(model, str) else fitted_to_surfaces(job, geometry, model, motion, choice[source])
     if fit is None or isinstance(model, str):
-        label = _Label(geometry, job.run, motion)
+        label = _Label(geometry, job.run, motion.voters)
         ellipsoids = list(map_items(label, range(frames), job.executor, "labels", job.progress))
         job.run.note("segmentation", [job.run.frame_file("bodies", k) for k in range(frames)])
         write_ellipsoids(job.run, Ellipsoids.stack(ellipsoids, np.arange(bodies.body_count, dtype=np.int32)))
@@ -126,10 +127,10 @@ class _Label:
 
     geometry: Geometry
     run: Run
-    motion: Motion
+    voters: Voters
 
     def __call__(self, frame: int) -> Ellipsoids:
         points = self.geometry.points(frame)
-        label = self.motion.label(frame, points)
+        label = label_points(self.voters, frame, points)
         write_points(self.run.frame_file("bodies", frame), BodyPoints(points, label))
-        return fit_ellipsoids(points, label, self.motion.body_count, self.geometry.spacing)
+        return fit_ellipsoids(points, label, len(self.voters.shapes), self.geometry.spacing)
