@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from itertools import count
 
@@ -14,7 +15,8 @@ from geomocap.carving.subject_bounds import subject_box
 from geomocap.carving.voxel_grid import Grid
 from geomocap.errors import GeometryError
 
-MOST_VOXELS = 1 << 30  # one bit each: 128 MB; a longer way than this is carved more coarsely
+# One bit each: 128 MB. A longer way than this is carved more coarsely; finer voxels that were asked for are refused.
+MOST_VOXELS = 1 << 30
 MOST_STRETCHED = 1.5  # times its median length: the longest that a subject is taken for
 
 _DEFAULT = CarvingSettings()
@@ -39,11 +41,12 @@ def working_volume(
     Raises
     ------
     GeometryError
-        If silhouettes are empty or have no common volume (the camera that contradicts the others is named), or if
-        the cameras, all on one side, don't bound the subject.
+        If silhouettes are empty or have no common volume (the camera that contradicts the others is named), if
+        the cameras, all on one side, don't bound the subject, or if more than `MOST_VOXELS` voxels are asked for.
     """
     if settings.volume is not None:
         low, high = (np.array(corner, dtype=np.float64) for corner in settings.volume)
+        _check_count(high - low, settings)
         return Grid.of_box(low, high, resolution=settings.resolution, voxel_size=settings.voxel_size)
     box: tuple[np.ndarray, np.ndarray] | None = None
     lengths: list[float] = []
@@ -78,4 +81,31 @@ def working_volume(
     low, high = box[0] - margin, box[1] + margin
     if settings.voxel_size is None:
         edge = max(edge, float(np.cbrt(np.prod(high - low) / MOST_VOXELS)))
+    else:
+        _check_count(high - low, settings)
     return Grid.of_box(low, high, voxel_size=edge)
+
+
+def _check_count(size: np.ndarray, settings: CarvingSettings) -> None:
+    """Refuse more voxels than `MOST_VOXELS` in a box of sides (3,), metres; what is empty is not looked at."""
+    if not (np.isfinite(size).all() and (size > 0).all()):
+        return
+    edge = settings.voxel_size or float(size.max()) / settings.resolution
+    if (count := _count(size, edge)) <= MOST_VOXELS:
+        return
+    least = float(np.cbrt(np.prod(size) / MOST_VOXELS))
+    while _count(size, least) > MOST_VOXELS:
+        least *= 1.001
+    least = float(f"{1.006 * least:.3g}")  # no less when rounded
+    asked, possible = f"carving.voxel_size = {settings.voxel_size} m", f"set {least:g} m or more"
+    if settings.voxel_size is None:
+        asked, possible = f"carving.resolution = {settings.resolution}", f"set {int(size.max() / least)} or less"
+    sides = " × ".join(f"{side:.3g}" for side in size)
+    raise GeometryError(
+        f"{asked} makes {count:.2g} voxels in the volume of {sides} m, at most {MOST_VOXELS:.2g} are possible; "
+        f"{possible}, or a smaller carving.volume"
+    )
+
+
+def _count(size: np.ndarray, edge: float) -> float:
+    return math.prod(np.ceil(size / max(edge, 1e-90)).tolist())

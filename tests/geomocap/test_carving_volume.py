@@ -21,7 +21,7 @@ from geomocap.carving.frames import carve_frame
 from geomocap.carving.hull import heard, hull, rounding_bounds
 from geomocap.carving.silhouette_views import PinholeViews
 from geomocap.carving.subject_bounds import connected_keys, subject_box
-from geomocap.carving.volume import working_volume
+from geomocap.carving.volume import MOST_VOXELS, working_volume
 from geomocap.carving.voxel_grid import Grid
 from geomocap.errors import CalibrationError, GeometryError
 from tests.geomocap.carving_scenes import FIGURE, look_at, ring, silhouettes
@@ -93,6 +93,35 @@ def test_settings_decide_before_anything_is_measured():
     assert grid.shape == (40, 40, 40) and grid.voxel_size == 0.05
     with pytest.raises(GeometryError, match="no frames"):
         working_volume([])
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        CarvingSettings(volume=((-1, -1, 0), (1, 1, 2)), voxel_size=0.0005),
+        CarvingSettings(volume=((-1, -1, 0), (1, 1, 2)), voxel_size=1e-300),
+        CarvingSettings(volume=((-1, 0, 0), (1, 0.001, 0.5)), voxel_size=2e-5),
+        CarvingSettings(voxel_size=0.0005),
+    ],
+    ids=["given", "beyond all numbers", "thin", "found"],
+)
+def test_voxels_finer_than_memory_holds_are_refused_with_the_finest_possible(settings):
+    frames = [figure(ring(6))]
+    with pytest.raises(GeometryError, match=r"carving\.voxel_size = .* makes .* set .* m or more") as raised:
+        working_volume(frames, settings)
+    named = float(str(raised.value).partition("set ")[2].partition(" m")[0])
+    count = np.prod(working_volume(frames, settings.model_copy(update={"voxel_size": named})).shape, dtype=float)
+    assert 0.9 * MOST_VOXELS < count <= MOST_VOXELS
+    with pytest.raises(GeometryError, match=f"set {named:g} m"):
+        working_volume(frames, settings.model_copy(update={"voxel_size": 0.98 * named}))
+
+
+def test_a_resolution_that_a_given_volume_is_too_large_for_is_refused():
+    cube = CarvingSettings(volume=((-1, -1, 0), (1, 1, 2)), resolution=2048)
+    with pytest.raises(GeometryError, match=r"carving\.resolution = 2048 makes 8\.6e\+09 .* set 10\d\d or less"):
+        working_volume([], cube)
+    flat = CarvingSettings(volume=((-1, -1, 0), (1, 1, 0.1)), resolution=2048)
+    assert working_volume([], flat).shape == (2048, 2048, 103)
 
 
 def test_volume_of_what_not_all_cameras_see():
