@@ -22,11 +22,11 @@ RATE_TOLERANCE = 0.01
 
 
 def evaluate(
-    run: Path,
-    truth: Path,
+    run: str | Path,
+    truth: str | Path,
     settings: EvaluationSettings | None = None,
     *,
-    matches: Path | None = None,
+    matches: str | Path | None = None,
     unit: Unit = "m",
     up: Axis | None = None,
     progress: Progress = silent,
@@ -35,12 +35,12 @@ def evaluate(
 
     Parameters
     ----------
-    run : Path
+    run : str or Path
         Run folder; what it has files for is judged.
-    truth : Path
+    truth : str or Path
         A synthetic capture's truth (folder with truth.npz), or a C3D, TRC or BVH file of another system.
     settings : EvaluationSettings, optional
-    matches : Path, optional
+    matches : str or Path, optional
         TOML that says which marker is which joint: `joint_body01_body03 = "LKNE"`. Another system only.
     unit : "m", "cm" or "mm"
         Unit of a BVH, which can't say it itself.
@@ -56,6 +56,7 @@ def evaluate(
         If a motion file can't be read.
     """
     settings = settings or EvaluationSettings()
+    run, truth = Path(run), Path(truth)
     if not run.is_dir():
         raise EvaluationError(f"{run}: no such run folder")
     if truth.is_dir() or truth.suffix.lower() == ".npz":
@@ -65,7 +66,7 @@ def evaluate(
     opened = Run(run)
     found = run_markers(opened, read_skeleton(opened), None, run_up(opened), ellipsoids=False)
     other = read_motion_file(truth, unit=unit, up=up)
-    return compare_markers(found, other, settings, matches=read_matches(matches) if matches else None)
+    return compare_markers(found, other, settings, matches=read_matches(Path(matches)) if matches else None)
 
 
 def evaluate_synthetic(

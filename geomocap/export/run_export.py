@@ -100,27 +100,27 @@ class Exported:
 
 
 def export_run(
-    run: Run,
+    run: Run | str | Path,
     formats: Sequence[str] | None = None,
     settings: ExportSettings | None = None,
     *,
     names: Names | None = None,
-    folder: Path | None = None,
+    folder: str | Path | None = None,
     progress: Progress = silent,
 ) -> Exported:
     """Write the motion files of a run, each whole or not at all.
 
     Parameters
     ----------
-    run : Run
-        With `skeleton.npz`.
+    run : Run, str or Path
+        The run or its folder, with `skeleton.npz`.
     formats : sequence of str, optional
         Of those in `FILES`. By default all whose packages are installed but those `ON_REQUEST`.
     settings : ExportSettings, optional
         By default those of the run.
     names : Names, optional
         The user's names; by default those that `settings.names` asks for.
-    folder : Path, optional
+    folder : str or Path, optional
         Where to write; by default the run.
     progress : Progress
 
@@ -133,6 +133,8 @@ def export_run(
     SettingsError
         If the run's settings are wrong.
     """
+    run = run if isinstance(run, Run) else Run(Path(run))
+    into = run.path if folder is None else Path(folder)
     settings = settings or run_settings(run)
     unknown = sorted(set(formats or ()) - set(FILES))
     if unknown:
@@ -161,11 +163,11 @@ def export_run(
         "fbx": lambda path: _write_fbx(path, shown, skinned),
         "movement": lambda path: write_movement(path, markers),
     }
-    remove_remains([folder or run.path])
+    remove_remains([into])
     files, skipped = {}, {}
     chosen = list(formats) if formats is not None else [name for name in FILES if name not in ON_REQUEST]
     for k, name in enumerate(chosen):
-        path = (folder or run.path) / FILES[name]
+        path = into / FILES[name]
         try:
             writers[name](path)
             files[name] = path
@@ -174,7 +176,7 @@ def export_run(
                 raise
             skipped[name] = str(error)
         progress("export", k + 1, len(chosen))
-    listed = (folder or run.path) / NAMES_FOUND
+    listed = into / NAMES_FOUND
     if found.template is not None:
         write_text(listed, names_text(found))
     else:

@@ -191,14 +191,19 @@ def write_model(path: Path, model: SubjectModel) -> None:
     write_npz(path, {"kind": np.array(KIND), "version": np.array(VERSION), **values})
 
 
-def read_model(path: Path) -> SubjectModel:
+def read_model(path: str | Path) -> SubjectModel:
     """Read a `model.npz`, never executing anything in it.
+
+    Parameters
+    ----------
+    path : str or Path
 
     Raises
     ------
     GeometryError
         If the file is missing, damaged, no model, or inconsistent.
     """
+    path = Path(path)
     if not path.is_file():
         raise GeometryError(f"{path}: no such model; a run by motion writes its subject's as model.npz")
     try:

@@ -190,6 +190,7 @@ def test_a_perfect_run_is_perfect(tmp_path):
     assert f["joints.recall_at_5%h"] == f["joints.precision_at_10%h"] == f["skeleton.true_edges_found"] == 1
     assert f["joints.mean_error"] == pytest.approx(0, abs=1e-9)
     assert f["motion.body_rotation_error_deg"] == pytest.approx(0, abs=1e-4)
+    assert evaluate(str(run.path), str(truth)).figures == f
     assert f["skeleton.false_edges"] == 0
 
 

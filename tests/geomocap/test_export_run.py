@@ -52,6 +52,14 @@ def test_only_what_was_asked_for_and_elsewhere(run, tmp_path):
         export_run(run, ["doc"])
 
 
+def test_folders_may_be_given_as_text(run, tmp_path):
+    exported = export_run(str(run.path), ["bvh"], folder=str(tmp_path / "out"))
+    assert exported.files == {"bvh": tmp_path / "out" / "motion.bvh"} and exported.files["bvh"].is_file()
+    assert export_run(run.path, ["bvh"]).files == {"bvh": run.path / "motion.bvh"}
+    with pytest.raises(RunError):
+        export_run(str(tmp_path / "none"))
+
+
 def test_the_same_run_gives_the_same_files(run, tmp_path):
     chosen = ["bvh", "trc", "glb", "csv"]
     first = export_run(run, chosen, folder=tmp_path / "a").files

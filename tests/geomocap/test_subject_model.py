@@ -98,6 +98,7 @@ def test_model_file_comes_back_as_it_was(model, tmp_path):
     again = read_model(tmp_path / "model.npz")
     for name in SubjectModel.__dataclass_fields__:
         np.testing.assert_array_equal(getattr(again, name), getattr(model, name))
+    assert read_model(str(tmp_path / "model.npz")).body_names.tolist() == model.body_names.tolist()
 
 
 def test_a_model_moves_in_another_world_as_it_does_in_its_own(model):
