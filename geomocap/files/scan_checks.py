@@ -67,7 +67,10 @@ def check_points(points: np.ndarray, name: str) -> None:
             )
         across = float(np.ptp(points, axis=0).max())
         if not SMALLEST <= across <= LARGEST:
-            raise GeometryError(f"{name}: is {across:.3g} m across; set scans.scale to the metres of its unit")
+            expected = f"expected {SMALLEST:g} to {LARGEST:g}"
+            raise GeometryError(
+                f"{name}: is {across:.3g} m across, {expected}; set scans.scale to the metres of its unit"
+            )
 
 
 def scan_doubts(

@@ -29,9 +29,12 @@ from geomocap.files.scan_geometry import (
     read_surface,
 )
 from geomocap.files.scan_settings import ScanSettings
+from geomocap.model.axis_order import seem_swapped
+from geomocap.model.even_choice import evenly_chosen
 from geomocap.model.surface import point_spacing
 from geomocap.reading import list_folder
 
+_LOOKED_AT = 24  # frames
 _FARTHEST = 1e5  # diagonals from the origin; ten times farther the equations of motion lose their last digits
 
 
@@ -88,6 +91,34 @@ class Scans:
             If the scan can't be read, holds no points, infinite coordinates, only points that coincide, or points too
             far from the origin for their diagonal.
         """
+        try:
+            return self._checked_surface(frame)
+        except GeometryError as error:
+            if not self.in_array:
+                raise
+            count, points = len(self), len(self.read(frame).points)
+            why = f"; an array holds (T frames, N points, 3), this one has {count} frames of {points} points"
+            raise GeometryError(f"{error}{why}") from None
+
+    @property
+    def in_array(self) -> bool:
+        """Whether frames are those of one array that doesn't say its axes itself."""
+        return self.source.suffix.lower() in ARRAY_ENDINGS and not self.tracked and len(self) > 1
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Say so if an array (T, N, 3) seems to hold the axes of frames and points the other way round."""
+        if not self.in_array:
+            return ()
+        points = np.stack([self.read(frame).points for frame in evenly_chosen(len(self), _LOOKED_AT)])
+        if not seem_swapped(points.swapaxes(0, 1)):
+            return ()
+        return (
+            f"{self.source}: frames and points seem to be swapped; expected (T frames, N points, 3), it is taken as "
+            f"{len(self)} frames of {points.shape[1]} points",
+        )
+
+    def _checked_surface(self, frame: int) -> ScanSurface:
         name = self.names[frame]
         surface = self.read(frame).scaled(self.settings.scale)
         points = surface.points
@@ -141,7 +172,7 @@ class Scans:
         return fingerprint([self.source])
 
 
-def open_scans(source: Path, settings: ScanSettings) -> Scans:
+def open_scans(source: str | Path, settings: ScanSettings) -> Scans:
     """Open a file or a folder of scans; of a folder nothing but names is read yet.
 
     Raises

@@ -68,7 +68,7 @@ def _doubting(job: Job, work: Callable[[], int]) -> int:
     """Do the work, of scans after these have been compared; what is doubtful about them is written with the results."""
     if job.scans is None or len(job.scans) == 1:
         return work()
-    doubts = scan_doubts(job.scans.points, job.scans.names, job.progress)
+    doubts = (*job.scans.doubts, *scan_doubts(job.scans.points, job.scans.names, job.progress))
     frames = work()
     if doubts:
         write_warnings(job.run, [*doubts, *read_warnings(job.run)])

@@ -13,6 +13,7 @@ from geomocap.config import load_config
 from geomocap.errors import SettingsError
 from geomocap.export.trc import read_trc
 from geomocap.files.capture import Capture
+from geomocap.files.results import read_warnings
 from geomocap.files.run import Run
 from geomocap.files.scans import open_scans
 from geomocap.inspection import describe
@@ -61,6 +62,12 @@ def test_scans_leave_tracks_of_a_capture_alone(job):
     scans.run.write_npz("tracks.npz", positions=tracks, sigma=np.full((500, 6), 0.002))
     segment(scans, "scans")
     assert scans.run.read_npz("diagnostics.npz")["paths"] == "nodes"
+
+
+def test_frames_that_seem_to_be_points_are_told_with_the_results(job):
+    scans = job(scanned(24)[:, ::8].swapaxes(0, 1), {"segmentation": {"paths": "points"}})
+    segment(scans, "scans")
+    assert "frames and points seem to be swapped" in read_warnings(scans.run)[0]
 
 
 def test_points_that_scans_have_in_common_are_followed(job):

@@ -22,6 +22,7 @@ from geomocap.model.frame_geometry import Voxels
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.sources import geometry_of
 from geomocap.scheduling import threads
+from tests.geomocap.moving_chains import chain
 
 
 def test_triangles_given_several_times_are_taken_once(tmp_path):
@@ -135,6 +136,24 @@ def test_points_that_can_be_no_surface_are_refused(tmp_path):
     box.export(tmp_path / "far.ply")
     with pytest.raises(GeometryError, match=r"far\.ply: .*infinite"):
         open_scans(tmp_path / "far.ply", ScanSettings()).points(0)
+
+
+def test_arrays_whose_points_come_first_are_told(tmp_path):
+    """As tracks (N, T, 3) they would be right; a scan of one point's path is small, which is no matter of its unit."""
+    tracks = chain(3).positions[::3]
+    tracks[40] = tracks[40, 0] + 1e-16 * np.arange(24)[:, None]  # rests
+    np.save(tmp_path / "tracks.npy", tracks)
+    np.save(tmp_path / "scans.npy", tracks.swapaxes(0, 1))
+    swapped = open_scans(tmp_path / "tracks.npy", ScanSettings())
+    with pytest.raises(
+        GeometryError, match=r"frame 40: .* m across.*an array holds \(T frames, N points, 3\).* 90 frames"
+    ):
+        swapped.points(40)
+    assert "frames and points seem to be swapped" in swapped.doubts[0]
+    assert open_scans(tmp_path / "scans.npy", ScanSettings()).doubts == ()
+    mixed = [np.random.default_rng(t).permutation(points) for t, points in enumerate(tracks.swapaxes(0, 1))]
+    np.save(tmp_path / "mixed.npy", mixed)
+    assert open_scans(tmp_path / "mixed.npy", ScanSettings()).doubts == ()
 
 
 def test_spacing_is_the_mean_distance_to_the_nearest_point(tmp_path):
