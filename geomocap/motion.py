@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
@@ -10,22 +10,28 @@ import numpy as np
 from pydantic import Field
 
 from geomocap.bodies.body_evidence import TURN_FRACTION
-from geomocap.bodies.motion_bodies import MotionBodies, MotionBodiesSettings
+from geomocap.bodies.motion_bodies import LEAST_SAMPLES, MotionBodies, MotionBodiesSettings
 from geomocap.bodies.point_labels import Voters, label_points
 from geomocap.bodies.ray_depths import find_bodies_and_depths
 from geomocap.bodies.rigid_motions import relative_turn
 from geomocap.bodies.track_labels import label_tracks
 from geomocap.errors import GeometryError
-from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.axis_order import seem_swapped
+from geomocap.model.motion_paths import LEAST_FRAMES, MotionPaths
 from geomocap.model.outlines import Outlines
 from geomocap.model.skeleton import Skeleton
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.nodes.node_tracking import track_nodes
 from geomocap.nodes.surface_coverage import even_spacing
 from geomocap.progress import Progress, silent
-from geomocap.settings import Settings
+from geomocap.settings import Settings, check_fps, check_settings
 from geomocap.skeleton.common_points import CommonPoint
-from geomocap.skeleton.motion_skeleton import MotionSkeleton, MotionSkeletonSettings, find_motion_skeleton
+from geomocap.skeleton.motion_skeleton import (
+    MotionSkeleton,
+    MotionSkeletonSettings,
+    find_motion_skeleton,
+    joined_apart,
+)
 from geomocap.skeleton.refinement import RefinementSettings, refine_skeleton
 from geomocap.trajectories.selection import spread_out
 
@@ -65,6 +71,8 @@ class Motion:
         Body of each track that was given; -1: none. Of scans, of each sample.
     voters : Voters
         Followed points whose bodies are known; they label others.
+    warnings : tuple of str
+        What makes the result doubtful, in words.
     """
 
     bodies: MotionBodies
@@ -72,6 +80,7 @@ class Motion:
     paths: MotionPaths
     labels: np.ndarray
     voters: Voters
+    warnings: tuple[str, ...] = ()
 
     @property
     def body_count(self) -> int:
@@ -98,11 +107,6 @@ class Motion:
         """Skin weights of the samples, (S, B) float; rows sum to 1."""
         return self.bodies.weights
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What makes the result doubtful, in words."""
-        return unsure_turns(self.bodies)
-
     def label(self, frame: int, points: np.ndarray) -> np.ndarray:
         """Bodies (M,) int32 of any points (M, 3), metres, of the surface in a frame."""
         return label_points(self.voters, frame, points)
@@ -128,6 +132,18 @@ def unsure_turns(bodies: MotionBodies) -> tuple[str, ...]:
         f"{_UNSURE_DEG:.0f}° expected): number of bodies, joints and skeleton are not to be trusted; use more "
         "cameras, more texture or more frames a second",
     )
+
+
+def other_number(asked: int, found: int) -> tuple[str, ...]:
+    """Say so if other than the bodies asked for (0: any number) were found."""
+    if asked in (0, found):
+        return ()
+    why = (
+        "what else moved by itself was so small, or so like what is beside it, that samples follow other bodies"
+        if found < asked
+        else "the others touch none of which they could be a part"
+    )
+    return (f"{found} bodies were found, {asked} were asked for (motion_bodies.bodies): {why}",)
 
 
 def find_motion(
@@ -173,6 +189,8 @@ def find_motion(
     ------
     GeometryError
         If the arrays have another shape, or there are too few tracks or frames.
+    SettingsError
+        If `fps` or `bodies` can't be.
 
     Examples
     --------
@@ -180,21 +198,30 @@ def find_motion(
     >>> motion.skeleton.joint_positions.shape          # doctest: +SKIP
     (60, 15, 3)
     """
+    check_fps(fps)
     settings = settings or MotionSettings()
     if bodies:
-        settings = settings.model_copy(update={"bodies": settings.bodies.model_copy(update={"bodies": bodies})})
-    given = None
+        asked = check_settings(MotionBodiesSettings, settings.bodies.model_dump() | {"bodies": bodies})
+        settings = settings.model_copy(update={"bodies": asked})
+    given: np.ndarray | None = None
+    doubts: tuple[str, ...] = ()
     if isinstance(tracks, MotionPaths):
         paths = tracks
     elif isinstance(tracks, np.ndarray):
         given, (paths, samples) = tracks, _sampled(tracks, sigma)
+        doubts = swapped_axes(tracks)
+    elif not isinstance(tracks, Iterable) or isinstance(tracks, str):
+        kind = type(tracks).__name__
+        raise GeometryError(f"tracks are {kind}, expected an array (N, T, 3), MotionPaths, or a list of scans (M, 3)")
     else:
         paths = _followed(tracks, settings.nodes, progress, executor)
     found, paths = find_bodies_and_depths(paths, settings.bodies, progress, outlines)
     progress("skeleton", 0, 1)
     connected, found = _connect(found, paths, fps, settings)
     progress("skeleton", 1, 1)
-    motion = Motion(found, connected, paths, found.label, Voters.of(found, paths))
+    doubts += (*unsure_turns(found), *other_number(settings.bodies.bodies, found.body_count))
+    doubts += joined_apart(connected, found.diagonal, settings.skeleton)
+    motion = Motion(found, connected, paths, found.label, Voters.of(found, paths), doubts)
     if given is None:
         return motion
     motion = motion.with_tracks(given)
@@ -226,10 +253,29 @@ def _connect(
         bodies = bodies.merged(large, small)
 
 
+def swapped_axes(tracks: np.ndarray) -> tuple[str, ...]:
+    """Say so if tracks (N, T, 3) seem to be given as (T, N, 3)."""
+    if not seem_swapped(tracks):
+        return ()
+    return (
+        f"the axes of the tracks seem to be swapped: what is taken as {len(tracks)} points in {tracks.shape[1]} frames "
+        "doesn't keep its distances as points of a surface do, but with the axes swapped it does; expected (N points, "
+        "T frames, 3); try tracks.swapaxes(0, 1)",
+    )
+
+
 def _sampled(tracks: np.ndarray, sigma: np.ndarray | None) -> tuple[MotionPaths, np.ndarray]:
     """Motion paths of long tracks, evenly over the surface, and which tracks these are, (S,) int."""
-    if tracks.ndim != 3 or tracks.shape[2] != 3:
-        raise GeometryError(f"tracks have shape {tracks.shape}, expected (N, T, 3): N points in T frames, metres")
+    if tracks.ndim != 3 or tracks.shape[2] != 3 or tracks.dtype.kind not in "fiu":
+        what = f"{tracks.dtype} of shape {tracks.shape}"
+        raise GeometryError(f"tracks are {what}, expected numbers of shape (N, T, 3): N points in T frames, metres")
+    count, frames = tracks.shape[:2]
+    if count < LEAST_SAMPLES or frames < LEAST_FRAMES:
+        raise GeometryError(
+            f"tracks of shape {tracks.shape} are {count} points in {frames} frames, at least {LEAST_SAMPLES} in "
+            f"{LEAST_FRAMES} are needed; expected (N points, T frames, 3)"
+            f"{'; the axes seem to be swapped, try tracks.swapaxes(0, 1)' if seem_swapped(tracks) else ''}"
+        )
     samples = evenly_over_surface(tracks)
     if sigma is not None:
         sigma = np.asarray(sigma, float)
@@ -252,7 +298,10 @@ def _followed(
     scans: Sequence[np.ndarray], settings: NodeTrackingSettings, progress: Progress, executor: Executor | None
 ) -> MotionPaths:
     """Motion paths of nodes that are followed through scans."""
-    points = [np.asarray(scan, float) for scan in scans]
+    try:
+        points = [np.asarray(scan, float) for scan in scans]
+    except (TypeError, ValueError):
+        raise GeometryError("scans hold something else than numbers, expected arrays (M, 3), metres") from None
     for frame, scan in enumerate(points):
         if scan.ndim != 2 or scan.shape[1] != 3:
             raise GeometryError(f"scan of frame {frame} has shape {scan.shape}, expected (M, 3), metres")

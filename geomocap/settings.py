@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from numbers import Real
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -121,6 +122,13 @@ def _table(model: type[BaseModel], place: tuple[int | str, ...]) -> type[BaseMod
             parts = _types(model.model_fields[str(part)].annotation)
             model = next((t for t in parts if isinstance(t, type) and issubclass(t, BaseModel)), model)
     return model
+
+
+def check_fps(fps: float) -> None:
+    """Refuse frames per second that no recording has, and what is no number; raises SettingsError."""
+    if isinstance(fps, bool) or not isinstance(fps, Real) or not LEAST_FPS <= float(fps) <= MOST_FPS:
+        given = shortened(repr(fps))
+        raise SettingsError(f"fps = {given}: expected {LEAST_FPS:g} to {MOST_FPS:,.0f} frames per second")
 
 
 def explained(error: ValidationError) -> str:

@@ -20,7 +20,7 @@ from geomocap.model.motion_paths import MotionPaths, sure_part
 from geomocap.progress import Progress, silent
 from geomocap.trajectories.completion import complete_tracks
 
-_LEAST_SAMPLES = 20
+LEAST_SAMPLES = 20
 _STAGE = "bodies"
 _IS_ONE = 0.5  # confidence of a body that explains just what is required
 
@@ -161,8 +161,8 @@ def find_motion_bodies(
         If there are too few samples.
     """
     settings = settings or MotionBodiesSettings()
-    if paths.count < _LEAST_SAMPLES:
-        raise GeometryError(f"motion paths: {paths.count} samples; at least {_LEAST_SAMPLES} are needed to find bodies")
+    if paths.count < LEAST_SAMPLES:
+        raise GeometryError(f"motion paths: {paths.count} samples; at least {LEAST_SAMPLES} are needed to find bodies")
     # Too many bodies
     positions, certainty = complete_tracks(paths)
     first = first_bodies(positions, certainty, paths, settings)

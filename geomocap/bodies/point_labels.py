@@ -8,6 +8,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from geomocap.bodies.motion_bodies import MotionBodies
+from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.point_grid import PointGrid
 from geomocap.model.surface import plane_normals
@@ -122,8 +123,18 @@ def label_points(voters: Voters, frame: int, points: np.ndarray) -> np.ndarray:
     Returns
     -------
     (M,) int32
+
+    Raises
+    ------
+    GeometryError
+        If there is no such frame, or the points have another shape or aren't finite.
     """
-    points = np.asarray(points, float).reshape(-1, 3)
+    points, frames = np.asarray(points, float), voters.positions.shape[1]
+    if not 0 <= frame < frames:
+        raise GeometryError(f"frame {frame}: there are frames 0 to {frames - 1}")
+    if (points.size and points.shape[-1:] != (3,)) or points.ndim > 2 or not np.isfinite(points).all():
+        raise GeometryError(f"points have shape {points.shape}, expected (M, 3), metres, finite")
+    points = points.reshape(-1, 3)
     if not len(points) or not len(voters.shapes):
         return np.full(len(points), -1, np.int32)
     parts = [_label_some(voters, frame, points[i : i + _CHUNK]) for i in range(0, len(points), _CHUNK)]

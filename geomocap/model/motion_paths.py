@@ -9,7 +9,7 @@ import numpy as np
 
 from geomocap.errors import GeometryError
 
-_LEAST_FRAMES = 2
+LEAST_FRAMES = 2
 DEPTH_FRACTION = 0.1  # of what is missed along a ray, counts
 _GIVE = 0.001  # diagonals; what surfaces give although they belong to a rigid body
 
@@ -43,8 +43,8 @@ class MotionPaths:
         if self.positions.ndim != 3 or self.positions.shape[2] != 3:
             raise GeometryError(f"motion paths: positions have shape {self.positions.shape}, expected (N, T, 3)")
         count, frames = self.positions.shape[:2]
-        if frames < _LEAST_FRAMES:
-            raise GeometryError(f"motion paths: {frames} frames; at least {_LEAST_FRAMES} are needed to see motion")
+        if frames < LEAST_FRAMES:
+            raise GeometryError(f"motion paths: {frames} frames; at least {LEAST_FRAMES} are needed to see motion")
         optional = {
             "rotations": (self.rotations, [(count, frames, 3, 3)]),
             "sigma": (self.sigma, [(count,), (count, frames)]),
@@ -54,6 +54,9 @@ class MotionPaths:
         for name, (array, shapes) in optional.items():
             if array is not None and array.shape not in shapes:
                 raise GeometryError(f"motion paths: {name} have shape {array.shape}, expected {shapes[-1]}")
+        if self.sigma is not None and (self.sigma < 0).any():
+            least = float(np.nanmin(self.sigma))
+            raise GeometryError(f"motion paths: sigma is {least:g} m somewhere; standard deviations aren't below 0")
         if not np.isfinite(self.positions).all(axis=2).any(axis=1).all():
             raise GeometryError("motion paths: a sample without any position; leave such samples out")
 
@@ -82,7 +85,7 @@ class MotionPaths:
         """Paths of the samples that are seen in some frames; None: there are none, or these are too few."""
         some = np.flatnonzero(self.seen[:, frames].any(axis=1))
         positions = self.positions[some, frames]
-        if not len(some) or positions.shape[1] < _LEAST_FRAMES:
+        if not len(some) or positions.shape[1] < LEAST_FRAMES:
             return None
         sigma = None if self.sigma is None else self.sigma[some] if self.sigma.ndim == 1 else self.sigma[some, frames]
         rotations, ray = (None if a is None else a[some, frames] for a in (self.rotations, self.ray))

@@ -17,6 +17,7 @@ from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.patches.patch_tracking import track_surface
 from geomocap.patches.seeding import image_reduction
 from geomocap.progress import Progress, silent
+from geomocap.settings import check_fps
 from geomocap.trajectories.filters import filter_trajectories
 from geomocap.trajectories.smoothing import smooth_motion
 from geomocap.trajectories.trajectory_settings import FilterSettings, SmoothingSettings
@@ -90,7 +91,10 @@ def track(
     ------
     GeometryError
         If the numbers of frames differ, or a frame can't be tracked.
+    SettingsError
+        If `fps` is none.
     """
+    check_fps(fps)
     settings = settings or TrackingSettings()
     if not len(images) == len(masks) == len(volumes):
         raise GeometryError(

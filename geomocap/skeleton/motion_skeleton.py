@@ -84,6 +84,24 @@ def find_motion_skeleton(
     return MotionSkeleton(skeleton, tuple(c.joint for c in chosen), costs, tuple(c.border for c in chosen))
 
 
+def joined_apart(found: MotionSkeleton, diagonal: float, settings: MotionSkeletonSettings) -> tuple[str, ...]:
+    """Say which bodies were connected although they are farther apart than bodies that touch somewhere."""
+    limit = settings.largest_gap * diagonal
+    names = found.skeleton.body_names
+    apart = [
+        f"{names[a]} and {names[b]} ({border.gap:.2g} m)"
+        for (a, b), border in zip(found.skeleton.joint_bodies, found.borders, strict=True)
+        if border.gap > limit
+    ]
+    if not apart:
+        return ()
+    return (
+        f"bodies are connected that are farther apart than {limit:.2g} m (motion_skeleton.largest_gap): "
+        f"{', '.join(apart)}; if they are things of their own, the joint between them is there for the motion files "
+        "only, which take one tree",
+    )
+
+
 def _connected_motion(linkage: Linkage, bodies: MotionBodies, middle: np.ndarray) -> BodyMotion:
     """Motion of connected bodies nearest to what each does by itself, as if each were six of its points."""
     count = bodies.body_count
@@ -104,7 +122,10 @@ def _connected_motion(linkage: Linkage, bodies: MotionBodies, middle: np.ndarray
 def possible_connections(
     bodies: MotionBodies, settings: MotionSkeletonSettings, independence: float = INDEPENDENT
 ) -> list[Connection]:
-    """Joints between all bodies that come near each other, and more until every body can be reached."""
+    """Joints between all bodies that come near each other, and more until every body can be reached.
+
+    Motion files take one tree of bodies; see `joined_apart`.
+    """
     count = bodies.body_count
     limit = settings.largest_gap * bodies.diagonal
     borders = find_borders(bodies, limit)

@@ -23,7 +23,12 @@ class MotionSkeletonSettings(Settings):
     contact_weight: float = Field(
         default=0.01, ge=0, description="tree: cost of bodies without common border (diagonals)"
     )
-    largest_gap: float = Field(default=0.1, gt=0, description="bodies farther apart are not connected (diagonals)")
+    largest_gap: float = Field(
+        default=0.1,
+        gt=0,
+        description="bodies farther apart are connected, with a warning, only where some body can't be reached "
+        "otherwise: motion files take one tree (diagonals)",
+    )
 
 
 class RefinementSettings(Settings):

@@ -11,7 +11,7 @@ from numpy.testing import assert_array_equal
 
 import geomocap
 from geomocap.carving.carving_settings import CarvingSettings
-from geomocap.errors import CaptureError, GeometryError
+from geomocap.errors import CaptureError, GeometryError, SettingsError
 from geomocap.patches.patch_settings import TrackingSettings
 from tests.geomocap.ball import HEIGHT, RADIUS, WIDTH, Texture, off_surface, photograph, ring
 from tests.geomocap.moving_chains import chain, same_partition
@@ -53,6 +53,71 @@ def test_arrays_of_another_shape_are_refused_in_one_line(wrong):
 def test_standard_deviations_of_another_shape_are_refused(three):
     with pytest.raises(GeometryError, match="sigma"):
         geomocap.find_motion(three.positions, fps=30, sigma=np.ones(2))
+
+
+def test_swapped_axes_of_tracks_are_told(three):
+    swapped = three.positions[::3].swapaxes(0, 1)
+    motion = geomocap.find_motion(swapped, fps=30)
+    assert "axes of the tracks seem to be swapped" in motion.warnings[0]
+    with pytest.raises(
+        GeometryError, match=r"12 points in 90 frames.*\(N points, T frames, 3\); the axes seem to be sw"
+    ):
+        geomocap.find_motion(swapped[::2], fps=30)
+    with pytest.raises(GeometryError, match=r"12 points in 2 frames, .*expected \(N points, T frames, 3\)$"):
+        geomocap.find_motion(swapped[::2, :2], fps=30)
+
+
+def test_another_number_of_bodies_than_asked_for_is_told(three):
+    motion = geomocap.find_motion(three.positions, fps=30, bodies=10)
+    assert motion.body_count < 10
+    assert [f"{motion.body_count} bodies were found, 10 were asked for" in line for line in motion.warnings] == [True]
+    assert geomocap.find_motion(three.positions, fps=30, bodies=3).warnings == ()
+
+
+def test_bodies_that_nothing_holds_together_are_told():
+    one, other = chain(1).positions, chain(1, seed=3).positions[:, ::-1]
+    motion = geomocap.find_motion(np.concatenate([one, other + np.array([0.0, 0.0, 1.3])]), fps=30)
+    assert motion.skeleton.joint_count == 1  # files take one tree
+    (line,) = motion.warnings
+    assert "farther apart than" in line and "body00 and body01 (1.2 m)" in line
+
+
+@pytest.mark.parametrize("bodies", [-1, 2.5, 500, True])
+def test_a_number_of_bodies_that_cant_be_is_refused(three, bodies):
+    with pytest.raises(SettingsError, match="bodies"):
+        geomocap.find_motion(three.positions, fps=30, bodies=bodies)
+
+
+@pytest.mark.parametrize("fps", [0, -30.0, float("nan"), float("inf"), None, "30"])
+def test_frames_per_second_that_cant_be_are_refused(three, fps):
+    with pytest.raises(SettingsError, match="frames per second"):
+        geomocap.find_motion(three.positions, fps=fps)
+    with pytest.raises(SettingsError, match="frames per second"):
+        geomocap.track([], [], [], None, fps=fps)
+
+
+@pytest.mark.parametrize("tracks", [None, 3, "tracks.npy", ["a"], np.full((30, 9, 3), "a"), np.zeros((30, 0, 3))])
+def test_what_is_no_tracks_is_refused(tracks):
+    with pytest.raises(GeometryError, match="expected"):
+        geomocap.find_motion(tracks, fps=30)
+
+
+def test_standard_deviations_below_zero_are_refused(three):
+    with pytest.raises(GeometryError, match=r"sigma is -0\.001 m"):
+        geomocap.find_motion(three.positions, fps=30, sigma=np.full(len(three.positions), -0.001))
+
+
+def test_frames_and_points_that_cant_be_are_refused_where_bodies_are_asked(three):
+    motion = geomocap.find_motion(three.positions, fps=30)
+    points = three.positions[:, 3]
+    for frame in (-1, 24, 99):
+        with pytest.raises(GeometryError, match=f"frame {frame}: there are frames 0 to 23"):
+            motion.label(frame, points)
+    for wrong in (points.T, three.positions, points[:, :2], np.full((4, 3), np.nan)):
+        with pytest.raises(GeometryError, match=r"points have shape .* expected \(M, 3\)"):
+            motion.label(0, wrong)
+    assert_array_equal(motion.label(3, points[7]), motion.label(3, points)[7:8])
+    assert motion.label(3, []).shape == (0,)
 
 
 def test_importing_the_library_loads_nothing_heavy():
