@@ -35,6 +35,7 @@ from geomocap.model.surface import point_spacing
 from geomocap.reading import list_folder
 
 _LOOKED_AT = 24  # frames
+_ORDER = "(T frames, N points, 3)"
 _FARTHEST = 1e5  # diagonals from the origin; ten times farther the equations of motion lose their last digits
 
 
@@ -94,11 +95,16 @@ class Scans:
         try:
             return self._checked_surface(frame)
         except GeometryError as error:
-            if not self.in_array:
-                raise
-            count, points = len(self), len(self.read(frame).points)
-            why = f"; an array holds (T frames, N points, 3), this one has {count} frames of {points} points"
-            raise GeometryError(f"{error}{why}") from None
+            raise self.with_order(error) from None
+
+    def with_order(self, error: GeometryError) -> GeometryError:
+        """Return an error that says, of an array, which order of axes is expected: another one may be what is wrong."""
+        if not self.in_array or _ORDER in str(error):
+            return error
+        taken = f"{len(self)} frames of {len(self.read(0).points)} points"
+        if self.doubts:
+            return GeometryError(f"{self.doubts[0]}; if that is right: {str(error).removeprefix(f'{self.source}, ')}")
+        return GeometryError(f"{error}; expected {_ORDER}, the array is taken as {taken}")
 
     @property
     def in_array(self) -> bool:
@@ -114,7 +120,7 @@ class Scans:
         if not seem_swapped(points.swapaxes(0, 1)):
             return ()
         return (
-            f"{self.source}: frames and points seem to be swapped; expected (T frames, N points, 3), it is taken as "
+            f"{self.source}: frames and points seem to be swapped; expected {_ORDER}, it is taken as "
             f"{len(self)} frames of {points.shape[1]} points",
         )
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
-from geomocap.errors import SettingsError
+from geomocap.errors import GeometryError, SettingsError
 from geomocap.files.results import (
     WARNINGS,
     read_warnings,
@@ -68,7 +68,10 @@ def _doubting(job: Job, work: Callable[[], int]) -> int:
     """Do the work, of scans after these have been compared; what is doubtful about them is written with the results."""
     if job.scans is None or len(job.scans) == 1:
         return work()
-    doubts = (*job.scans.doubts, *scan_doubts(job.scans.points, job.scans.names, job.progress))
+    try:
+        doubts = (*job.scans.doubts, *scan_doubts(job.scans.points, job.scans.names, job.progress))
+    except GeometryError as error:
+        raise job.scans.with_order(error) from None
     frames = work()
     if doubts:
         write_warnings(job.run, [*doubts, *read_warnings(job.run)])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from geomocap.config import load_config
-from geomocap.errors import SettingsError
+from geomocap.errors import GeometryError, SettingsError
 from geomocap.export.trc import read_trc
 from geomocap.files.capture import Capture
 from geomocap.files.results import read_warnings
@@ -68,6 +68,13 @@ def test_frames_that_seem_to_be_points_are_told_with_the_results(job):
     scans = job(scanned(24)[:, ::8].swapaxes(0, 1), {"segmentation": {"paths": "points"}})
     segment(scans, "scans")
     assert "frames and points seem to be swapped" in read_warnings(scans.run)[0]
+
+
+def test_scans_that_cant_be_compared_are_refused_with_the_order_of_an_array(job):
+    path = np.linspace(0, 1, 6)[:, None] * np.array([1.0, 0.0, 0.0])
+    scans = job(path + np.random.default_rng(0).normal(size=(40, 1, 3)))  # each point goes straight on
+    with pytest.raises(GeometryError, match=r"frame 0: all its points lie in a line.* 40 frames of 6 points"):
+        segment(scans, "scans")
 
 
 def test_points_that_scans_have_in_common_are_followed(job):

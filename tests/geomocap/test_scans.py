@@ -146,11 +146,14 @@ def test_arrays_whose_points_come_first_are_told(tmp_path):
     np.save(tmp_path / "scans.npy", tracks.swapaxes(0, 1))
     swapped = open_scans(tmp_path / "tracks.npy", ScanSettings())
     with pytest.raises(
-        GeometryError, match=r"frame 40: .* m across.*an array holds \(T frames, N points, 3\).* 90 frames"
+        GeometryError, match=r"swapped; expected \(T frames, N points, 3\).* 90 fr.*right: frame 40: .* m across"
     ):
         swapped.points(40)
     assert "frames and points seem to be swapped" in swapped.doubts[0]
     assert open_scans(tmp_path / "scans.npy", ScanSettings()).doubts == ()
+    np.save(tmp_path / "one.npy", np.ones((90, 24, 3)))
+    with pytest.raises(GeometryError, match=r"coincide; .*expected \(T frames, N points, 3\).* 90 frames of 24 points"):
+        open_scans(tmp_path / "one.npy", ScanSettings()).points(1)
     mixed = [np.random.default_rng(t).permutation(points) for t, points in enumerate(tracks.swapaxes(0, 1))]
     np.save(tmp_path / "mixed.npy", mixed)
     assert open_scans(tmp_path / "mixed.npy", ScanSettings()).doubts == ()
