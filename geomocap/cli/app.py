@@ -69,7 +69,7 @@ COMMANDS = {
     ),
     "info": (
         "info.info",
-        "Say what a capture, a run, a calibration, a truth, a motion file or scans hold, and what is wrong with them.",
+        "Say what a capture, run, calibration, truth, motion file or scans hold, what is wrong, and what is doubtful.",
     ),
 }
 _LOOK: dict[str, Any] = {
