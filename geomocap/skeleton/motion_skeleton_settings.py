@@ -34,8 +34,9 @@ class MotionSkeletonSettings(Settings):
 class RefinementSettings(Settings):
     """How the motion of connected bodies is refined over all frames."""
 
-    # 22 sets of paths of 13 captures, 1, 2 and 3 rounds: joints 2.20, 2.13 and 2.12 % of the height off, rotations 5.6,
-    # 5.7 and 5.8°, all else alike. One round leaves a joint too tight where the body between two others wasn't found.
+    # 22 sets of paths of 13 captures, 1 and 2 rounds: joints 2.20 and 2.13 % of the height off, rotations 5.6 and 5.7°,
+    # all else alike (3 rounds, which then fitted skin weights too: 2.12 %, 5.8°). One round leaves a joint too tight
+    # where the body between two others wasn't found.
     rounds: int = Field(
         default=2,
         ge=0,
