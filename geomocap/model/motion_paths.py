@@ -81,16 +81,6 @@ class MotionPaths:
         fullest = int(np.argmax(self.seen.sum(axis=0)))
         return float(np.linalg.norm(np.ptp(self.positions[self.seen[:, fullest], fullest], axis=0)))
 
-    def part(self, frames: slice) -> MotionPaths | None:
-        """Paths of the samples that are seen in some frames; None: there are none, or these are too few."""
-        some = np.flatnonzero(self.seen[:, frames].any(axis=1))
-        positions = self.positions[some, frames]
-        if not len(some) or positions.shape[1] < LEAST_FRAMES:
-            return None
-        sigma = None if self.sigma is None else self.sigma[some] if self.sigma.ndim == 1 else self.sigma[some, frames]
-        rotations, ray = (None if a is None else a[some, frames] for a in (self.rotations, self.ray))
-        return MotionPaths(positions, rotations, sigma, ray, None if self.parts is None else self.parts[some])
-
     def typical_sigma(self) -> np.ndarray:
         """Standard deviation of each sample's positions, (N,) float, metres: median over the frames; 0: not stated."""
         if self.sigma is None:

@@ -6,23 +6,19 @@ import numpy as np
 
 from geomocap.errors import GeometryError
 from geomocap.evaluation.result_check import SeenOutlines, checked_mesh, model_overlap
-from geomocap.model.frame_geometry import Geometry, GeometryPart
-from geomocap.model.motion_paths import MotionPaths
+from geomocap.model.frame_geometry import Geometry
 from geomocap.motion import Motion
-from geomocap.nodes.surface_coverage import SMALLEST_PIECE
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.window_following import surfaces_of
-from geomocap.skeleton.kinematics import BodyMotion, JointMotion, Linkage, body_motion, joint_motion
+from geomocap.pipeline.outline_reading import outline_points_of
 from geomocap.subject.model_building import BodyCloud, build_model
-from geomocap.subject.model_following import fit_motion
+from geomocap.subject.outline_fit import OutlineFit
 from geomocap.subject.subject_model import SubjectModel
-from geomocap.subject.window_motion import joined_motion, motion_of
+from geomocap.subject.window_motion import motion_of
 
 # Power of what the paths miss, beside what the model's drawn surface misses of the silhouettes. Of two results each of
 # fourteen sets of paths, of thirteen captures, the better was taken with any power from 0.15 to 0.48 in twelve, with
 # 0.5 in eleven, with 0 in nine; in one of the others neither was better. All had been looked at before it was set.
 _PATHS = 0.3
-_GOING_OVER = 3  # frames in which a motion goes over into the fit, and back; no other number was tried
 
 
 def make_model(job: Job, geometry: Geometry, motion: Motion) -> SubjectModel | str:
@@ -57,70 +53,29 @@ def misfit(motion: Motion, overlap: float) -> float:
     return (1.0 - overlap) * float(motion.bodies.residuals.mean()) ** _PATHS
 
 
-def fitted_to_surfaces(
-    job: Job, geometry: Geometry, model: SubjectModel, motion: Motion, paths: MotionPaths
-) -> tuple[BodyMotion, int] | None:
-    """Fit a motion's model to the surfaces where no path shows some body: its motion then, and in how many frames.
+def fitted_to_outlines(
+    job: Job, model: SubjectModel, motion: Motion, tracks: np.ndarray | None
+) -> tuple[SubjectModel, Motion]:
+    """Refine a motion and the shape of its model so that this ends in the images where the silhouettes do.
 
-    A surface alone knows less than paths do where these are: the other frames stay as they were found. (Overlap of a
-    person on a treadmill, four cameras, by a fit of all frames: 0.735 → 0.774 where paths didn't show some body, 0.828
-    → 0.803 elsewhere; of a stag, a dwarf and a horse it fell everywhere.) A stretch of frames is taken from the fit if
-    the model then overlaps their silhouettes more, by at least what the smallest piece of a surface is. `paths` are
-    those that the motion was found from. None: nothing is to be fitted, or no fit is kept.
+    `tracks` as in `Motion.with_tracks`, if any.
     """
-    unseen = (motion.bodies.reliability == 0).any(axis=1)
-    if job.capture is None or not unseen.any():
-        return None
-    found = joint_motion(model.linkage, motion.skeleton.body_rotations, motion.skeleton.root_positions)
-    bodies, kept = body_motion(model.linkage, found), 0
-    with job.run.timed("fit") as count:
-        seen, mesh = SeenOutlines.of(job.run, job.capture), checked_mesh(model)
-        for stretch in _stretches(unseen):
-            fit = _fitted(job, geometry, model, found, stretch, paths)
-            if fit is None:
-                continue
-            after = _put_in(model.linkage, bodies, stretch, fit)
-            least = model_overlap(seen, mesh, bodies, stretch) + SMALLEST_PIECE
-            if model_overlap(seen, mesh, after, stretch) >= least:
-                bodies, kept = after, kept + len(stretch)
-        count["items"] = int(unseen.sum())
-    return (bodies, kept) if kept else None
+    rounds = job.config.refinement.outline_rounds
+    outlines = outline_points_of(job) if rounds and job.config.refinement.rounds else None
+    if outlines is None:
+        return model, motion
+    with job.run.timed("outlines") as count:
+        fit = OutlineFit(checked_mesh(model), outlines)
+        refined = motion.refined(job.config.refinement.model_copy(update={"rounds": rounds}), fit, tracks)
+        count["items"] = outlines.frames
+        return fit.model(model, refined.connected), refined
 
 
-def _stretches(unseen: np.ndarray) -> list[range]:
-    """Stretches of frames that are marked, (T,) bool, with those between them that are too few to go over in."""
-    found: list[range] = []
-    for t in np.flatnonzero(unseen).tolist():
-        if found and t - found[-1].stop < 2 * _GOING_OVER:
-            found[-1] = range(found[-1].start, t + 1)
-        else:
-            found.append(range(t, t + 1))
-    return found
-
-
-def _around(stretch: range, frames: int) -> range:
-    """Return a stretch with the frames in which one motion goes over into the other."""
-    return range(max(stretch.start - _GOING_OVER, 0), min(stretch.stop + _GOING_OVER, frames))
-
-
-def _fitted(
-    job: Job, geometry: Geometry, model: SubjectModel, found: JointMotion, stretch: range, paths: MotionPaths
-) -> BodyMotion | None:
-    """Fit the model in and around a stretch; None if a frame shows next to nothing of the subject."""
-    part = _around(stretch, len(geometry))
-    frames = slice(part.start, part.stop)
-    read, settings = surfaces_of(GeometryPart(geometry, part), model), job.config.following
-    start, seen = found.part(frames), paths.part(frames)
-    try:
-        return fit_motion(model, start, read, geometry.spacing, seen, settings, job.progress).bodies
-    except GeometryError:
-        return None
-
-
-def _put_in(linkage: Linkage, bodies: BodyMotion, stretch: range, fit: BodyMotion) -> BodyMotion:
-    """Put the fit of a stretch into a motion."""
-    frames = len(bodies.rotations)
-    windows = [range(stretch.start), _around(stretch, frames), range(stretch.stop, frames)]
-    motions = [bodies.part(slice(windows[0].stop)), fit, bodies.part(slice(stretch.stop, None))]
-    some = [k for k, window in enumerate(windows) if len(window)]
-    return joined_motion(linkage, [windows[k] for k in some], [motions[k] for k in some])
+def unseen_frames(motion: Motion) -> list[str]:
+    """Say in how many frames no path shows some body."""
+    hidden = (motion.bodies.reliability == 0).any(axis=1)
+    if not hidden.any():
+        return []
+    return [
+        f"In {hidden.sum()} of {len(hidden)} frames no path shows some body; only silhouettes tell where it is there."
+    ]

@@ -14,13 +14,17 @@ from geomocap.model.diagnostics import Diagnostics
 from geomocap.model.ellipsoids import Ellipsoids, fit_ellipsoids
 from geomocap.model.frame_geometry import BodyPoints, Geometry
 from geomocap.motion import Motion, MotionSettings, find_motion
-from geomocap.pipeline.following_stage import write_followed
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.motion_models import fitted_to_surfaces, make_model, misfit, silhouette_overlap
+from geomocap.pipeline.motion_models import (
+    fitted_to_outlines,
+    make_model,
+    misfit,
+    silhouette_overlap,
+    unseen_frames,
+)
 from geomocap.pipeline.outline_reading import outlines_of
 from geomocap.pipeline.path_choice import motion_paths
 from geomocap.scheduling import map_items
-from geomocap.skeleton.kinematics import posed
 from geomocap.subject.subject_model import MODEL_FILE, SubjectModel, write_model
 
 
@@ -71,27 +75,19 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     source = min(candidates, key=lambda which: candidates[which].misfit)
     best = candidates[source]
     motion, model = best.motion, best.model
+    if not isinstance(model, str):
+        model, motion = fitted_to_outlines(job, model, motion, tracks)
     bodies, found = motion.bodies, motion.connected
-    warnings = [*camera_warnings(job.run), *motion.warnings]
-    axes = np.array([joint.axis for joint in found.joints]).reshape(-1, 3)
-    fit = None if isinstance(model, str) else fitted_to_surfaces(job, geometry, model, motion, choice[source])
-    if fit is None or isinstance(model, str):
-        label = _Label(geometry, job.run, motion.voters)
-        ellipsoids = list(map_items(label, range(frames), job.executor, "labels", job.progress))
-        job.run.note("segmentation", [job.run.frame_file("bodies", k) for k in range(frames)])
-        write_ellipsoids(job.run, Ellipsoids.stack(ellipsoids, np.arange(bodies.body_count, dtype=np.int32)))
-        write_skeleton(job.run, found.skeleton)
-        if isinstance(model, str):
-            warnings.append(model)
-        else:
-            write_model(job.run.path / MODEL_FILE, model)
+    warnings = [*camera_warnings(job.run), *motion.warnings, *unseen_frames(motion)]
+    label = _Label(geometry, job.run, motion.voters)
+    ellipsoids = list(map_items(label, range(frames), job.executor, "labels", job.progress))
+    job.run.note("segmentation", [job.run.frame_file("bodies", k) for k in range(frames)])
+    write_ellipsoids(job.run, Ellipsoids.stack(ellipsoids, np.arange(bodies.body_count, dtype=np.int32)))
+    write_skeleton(job.run, found.skeleton)
+    if isinstance(model, str):
+        warnings.append(model)
     else:
-        fitted, many = fit
-        write_followed(job, geometry, model, fitted)
-        axes = posed(model.linkage, fitted, 0).axes
-        warnings.append(
-            f"In {many} of {frames} frames no path shows some body; there the model was fitted to the surface."
-        )
+        write_model(job.run.path / MODEL_FILE, model)
     if warnings:
         write_warnings(job.run, warnings)
     made = Diagnostics(
@@ -103,7 +99,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
         reliability=bodies.reliability,
         joint_costs=found.costs,
         joint_is_hinge=motion.joint_is_hinge,
-        joint_axes=axes,
+        joint_axes=np.array([joint.axis for joint in found.joints]).reshape(-1, 3),
         joint_std=np.array([joint.std for joint in found.joints]).reshape(-1, 3),
         curve_bodies=np.array([step.bodies for step in bodies.curve]),
         curve_strengths=np.array([step.strength for step in bodies.curve]),

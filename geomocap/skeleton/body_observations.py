@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,6 +44,15 @@ class SkinPoints:
 
     def __len__(self) -> int:
         return len(self.rest)
+
+    def joined(self, other: SkinPoints) -> SkinPoints:
+        """Return these points, then those of another."""
+        most = max(self.bodies.shape[1], other.bodies.shape[1])
+        bodies, fractions = (
+            np.concatenate([np.pad(a, ((0, 0), (0, most - a.shape[1]))) for a in both])
+            for both in ((self.bodies, other.bodies), (self.fractions, other.fractions))
+        )
+        return SkinPoints(np.concatenate([self.rest, other.rest]), bodies, fractions)
 
     @property
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -105,7 +114,12 @@ class Observations:
 
     @classmethod
     def of_paths(
-        cls, positions: np.ndarray, sigma: np.ndarray, first_point: int = 0, ray: np.ndarray | None = None
+        cls,
+        positions: np.ndarray,
+        sigma: np.ndarray,
+        first_point: int = 0,
+        ray: np.ndarray | None = None,
+        depth: float = DEPTH_FRACTION,
     ) -> Observations:
         """Observations of points along their paths.
 
@@ -118,6 +132,8 @@ class Observations:
             Number of the first path's point.
         ray : (N, T, 3) float, optional
             Directions along which positions are unsure, see `MotionPaths`.
+        depth : float
+            Fraction of what is missed along these that counts.
         """
         frame, point = np.nonzero(np.isfinite(positions[:, :, 0]).T)
         start = np.searchsorted(frame, np.arange(positions.shape[1] + 1))
@@ -127,7 +143,7 @@ class Observations:
         if ray is None:
             up = np.tile([0.0, 0.0, 1.0], (len(target), 1))  # no view: kernels would be compiled for both
             return cls(start, numbers, target, up, weight, np.zeros(len(weight)))
-        return cls(start, numbers, target, ray[point, frame], weight, (DEPTH_FRACTION**2 - 1.0) * weight)
+        return cls(start, numbers, target, ray[point, frame], weight, (depth**2 - 1.0) * weight)
 
     @classmethod
     def of_frames(cls, frames: Sequence[tuple[np.ndarray, ...]]) -> Observations:
@@ -135,6 +151,10 @@ class Observations:
         start = np.concatenate([[0], np.cumsum([len(f[0]) for f in frames])])
         point, target, normal, isotropic, across = (np.concatenate([f[k] for f in frames]) for k in range(5))
         return cls(start, point.astype(np.int32), target, normal, isotropic, across)
+
+    def renumbered(self, first_point: int) -> Observations:
+        """The same of points that are counted from another number on."""
+        return replace(self, point=self.point + np.int32(first_point))
 
     def joined(self, other: Observations) -> Observations:
         """Both, frame by frame."""

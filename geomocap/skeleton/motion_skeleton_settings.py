@@ -44,6 +44,13 @@ class RefinementSettings(Settings):
         description="rounds of shape, and motion with joints; 0: no refinement",
         json_schema_extra={"flag": "refinement"},
     )
+    outline_rounds: int = Field(
+        default=3,
+        ge=0,
+        le=1000,
+        description="of captures: rounds in which, then, the surface is to end in the images where silhouettes do; "
+        "0: none",
+    )
     steps: int = Field(default=4, ge=1, le=1000, description="steps of each adjustment of motion and joints")
     independence: float = Field(
         default=0.3, gt=0, le=1, description="fraction of the observations that err independently of each other (0..1)"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -29,6 +30,16 @@ from geomocap.skeleton.motion_smoothness import Smoothness, typical_acceleration
 
 _MEDIAN_LENGTH = 1.54  # median length of a normal vector of three dimensions, standard deviations
 _SETTLE_ROUNDS = 3
+
+
+class Further(Protocol):
+    """What else than paths tells of a motion."""
+
+    def observe(self, bodies: BodyMotion) -> tuple[SkinPoints, Observations]:
+        """Return points at rest, and what is observed of them, judged by the motion found so far."""
+
+    def settle(self, pose: BodyMotion) -> None:
+        """Take note of the pose, a single frame, that is the rest pose of what was found."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +75,11 @@ class RefinedMotion:
 
 
 def refine_skeleton(
-    found: MotionSkeleton, bodies: MotionBodies, paths: MotionPaths, settings: RefinementSettings | None = None
+    found: MotionSkeleton,
+    bodies: MotionBodies,
+    paths: MotionPaths,
+    settings: RefinementSettings | None = None,
+    further: Further | None = None,
 ) -> tuple[MotionSkeleton, MotionBodies]:
     """Refine a skeleton and the bodies that it connects.
 
@@ -75,6 +90,8 @@ def refine_skeleton(
         Of the samples of `paths`.
     paths : MotionPaths
     settings : RefinementSettings, optional
+    further : Further, optional
+        More observations than those of the paths.
 
     Returns
     -------
@@ -88,7 +105,7 @@ def refine_skeleton(
     linkage, motion = linkage_of(found)
     points = SkinPoints.of_weights(bodies.rest, bodies.weights)
     misses = np.array([joint.miss for joint in found.joints])
-    refined = refine_motion(linkage, motion, points, paths, bodies.diagonal, settings, misses)
+    refined = refine_motion(linkage, motion, points, paths, bodies.diagonal, settings, misses, further)
     refined = replace(refined, linkage=joints_by_shape(refined.linkage, refined.bodies, found.borders, bodies.noise))
     bodies = replace(
         bodies,
@@ -164,6 +181,7 @@ def refine_motion(
     diagonal: float,
     settings: RefinementSettings | None = None,
     misses: np.ndarray | None = None,
+    further: Further | None = None,
 ) -> RefinedMotion:
     """Find, by turns, the shape at rest, and the motion of all frames together with the joints.
 
@@ -187,6 +205,8 @@ def refine_motion(
     misses : (J,) float, metres, optional
         How far the bodies, each by itself, carry each joint apart. A joint may slip by as much, and by what it still
         does after each round: one that is none, as a body between was not found, doesn't bend its bodies' motion.
+    further : Further, optional
+        More observations than those of the paths, in each round.
     """
     settings = settings or RefinementSettings()
     prior = JointPrior(linkage.joints, settings.joint_sigma * diagonal)
@@ -204,11 +224,16 @@ def refine_motion(
             motion = replace(joint_motion(linkage, bodies.rotations, motion.root), slip=motion.slip)
         # Motion and joints of the shape so far
         spread = np.broadcast_to(sigma[:, None] / np.sqrt(settings.independence), paths.seen.shape)
+        depth = DEPTH_FRACTION if further is None else 0.0  # silhouettes know it better
+        everything, seen = points, Observations.of_paths(paths.positions, spread, ray=paths.ray, depth=depth)
+        if further is not None:
+            more, told = further.observe(bodies)
+            everything, seen = points.joined(more), seen.joined(told.renumbered(len(points)))
         adjusted = adjust(
             linkage,
             motion,
-            points,
-            Observations.of_paths(paths.positions, spread, ray=paths.ray),
+            everything,
+            seen,
             smoothness=smoothness_of(linkage, motion, diagonal, settings),
             joint_prior=prior,
             looseness=looseness,
@@ -219,7 +244,10 @@ def refine_motion(
         assert motion.slip is not None
         slips = np.sqrt((motion.slip**2).sum(axis=2).mean(axis=0) / 3.0)
         looseness = np.clip(slips, tightest, looseness)
-    first = bodies.part(slice(0, 1)).carry(points.rest, points.bodies, points.fractions)[0]
+    start = bodies.part(slice(0, 1))
+    if further is not None:
+        further.settle(start)
+    first = start.carry(points.rest, points.bodies, points.fractions)[0]
     return RefinedMotion(posed(linkage, bodies, 0), since(bodies, 0), replace(points, rest=first), sigma)
 
 

@@ -71,7 +71,6 @@ def build_model(
     GeometryError
         If the frames agree on no surface.
     """
-    skeleton = found.skeleton
     frames = len(bodies.rotations)
     chosen = evenly_chosen(frames, FRAMES)
     motion = BodyMotion(bodies.rotations, bodies.translations)
@@ -79,6 +78,26 @@ def build_model(
     if len(points) < _LEAST_POINTS:
         raise GeometryError(f"model: the frames agree on {len(points)} surface points only; no model can be made")
     skin = _skin_of(points, body, bodies)
+    return _model(found, points, normals, colors, skin, float(spacing * CELL), up)
+
+
+def rebuilt_model(before: SubjectModel, found: MotionSkeleton, points: np.ndarray, normals: np.ndarray) -> SubjectModel:
+    """Return a model with another skeleton of its bodies, and its surface elsewhere: (P, 3) at rest, metres."""
+    skin = SkinPoints(points, before.skin_bodies, before.skin_weights)
+    return _model(found, points, normals, before.colors, skin, before.spacing, before.up)
+
+
+def _model(
+    found: MotionSkeleton,
+    points: np.ndarray,
+    normals: np.ndarray,
+    colors: np.ndarray,
+    skin: SkinPoints,
+    spacing: float,
+    up: int,
+) -> SubjectModel:
+    skeleton = found.skeleton
+    bodies = len(skeleton.body_names)
     return SubjectModel(
         points,
         normals,
@@ -94,10 +113,10 @@ def build_model(
         skeleton.body_names,
         skeleton.root,
         skeleton.body_positions[0, skeleton.root],
-        np.stack([_extents(points[body == b]) for b in range(bodies.body_count)]),
+        np.stack([_extents(points[skin.body == b]) for b in range(bodies)]),
         skeleton.local_rotations[key_poses(skeleton.local_rotations)],
         float(np.linalg.norm(np.ptp(points, axis=0))),
-        float(spacing * CELL),
+        spacing,
         up,
     )
 

@@ -1,7 +1,4 @@
-"""A known subject in a sequence: its model is found in a frame, followed, and fitted to all frames together.
-
-The same fit measures a motion that was found without the model wherever paths don't show it.
-"""
+"""A known subject in a sequence: its model is found in a frame, followed, and fitted to all frames together."""
 
 from __future__ import annotations
 
@@ -114,48 +111,6 @@ def follow_model(
     for order in (range(first + 1, frames), range(first - 1, -1, -1)):
         for t in _through(sequence, pieces, order, count):
             progress(_STAGE, 1 + abs(t - first), frames + 1)
-    return sequence.fitted_together(pieces, paths, first, progress)
-
-
-def fit_motion(
-    model: SubjectModel,
-    start: JointMotion,
-    read: Callable[[int], tuple[np.ndarray, np.ndarray | None]],
-    spacing: float,
-    paths: MotionPaths | None = None,
-    settings: FollowingSettings | None = None,
-    progress: Progress = silent,
-) -> FollowedSequence:
-    """Fit a motion that was found to the surfaces of all frames: they show bodies that no path follows.
-
-    From the frame that fits best on, both ways, each frame is fitted from the pose that was found and from where the
-    frame before leads; what fits better is kept. Then all frames are fitted together.
-
-    Parameters
-    ----------
-    model : SubjectModel
-    start : JointMotion
-        Of T frames, from the model's rest pose.
-    read, spacing, paths, settings, progress
-        See `follow_model`.
-
-    Raises
-    ------
-    GeometryError
-        If a frame holds too few points.
-    """
-    settings = settings or FollowingSettings()
-    frames = start.frames
-    sequence = _Sequence.of(model, read, frames, spacing, settings)
-    first = int(np.argmin(map_here(lambda t: sequence.misfit(start.part(slice(t, t + 1)), t), range(frames))))
-    pieces = {first: sequence.fitted(start.part(slice(first, first + 1)), first)}
-    for order in (range(first + 1, frames), range(first - 1, -1, -1)):
-        for t in order:
-            back = 1 if order.step > 0 else -1
-            starts = (start.part(slice(t, t + 1)), _carried_on(pieces[t - back], pieces.get(t - 2 * back)))
-            tried = map_here(partial(sequence.fitted_with_misfit, frame=t), starts)
-            pieces[t] = min(tried, key=lambda one: one[1])[0]
-            progress(_STAGE, len(pieces), frames + 1)
     return sequence.fitted_together(pieces, paths, first, progress)
 
 

@@ -39,5 +39,29 @@ def test_outlines_are_the_silhouettes_reduced(small_capture, tmp_path, monkeypat
     assert 0.9 < far.mean() < 1.0
 
 
+def test_points_of_outlines_are_found_in_all_frames(small_capture, tmp_path, monkeypatch):
+    capture = open_capture(small_capture)
+    point = np.array([0.0, 0.0, 1.0])
+    x, y = np.moveaxis(capture.rig.project(point[None])[:, 0], 1, 0)
+
+    def silhouette(run, camera, frame):
+        c = capture.cameras.index(camera)
+        mask = np.zeros((120, 160), np.uint8)
+        if not (c == 1 and frame == 2):
+            mask[int(y[c]) - 9 : int(y[c]) + 10, int(x[c]) - 9 : int(x[c]) + 10] = 255
+        return mask
+
+    monkeypatch.setattr(outline_reading, "read_silhouette", silhouette)
+    found = outline_reading.outline_points_of(Job(Run(tmp_path / "run"), Config(), None, capture=capture, fps=10.0))
+    assert found is not None and found.frames == FRAMES and len(found.points[0]) == CAMERAS
+    assert not len(found.points[2][1])  # an empty silhouette has no outline
+    pixel = found.projections @ np.append(point, 1.0)
+    for (u, v, w), outline in zip(pixel, found.points[0], strict=True):
+        away = outline[:, :2] - [u / w, v / w]
+        assert len(outline) > 12 and np.abs(away).max(axis=1).min() > 7 and np.abs(away).max() < 12
+        assert ((away * outline[:, 2:]).sum(axis=1) > 0).all()
+
+
 def test_without_a_capture_there_are_none(tmp_path):
-    assert outline_reading.outlines_of(Job(Run(tmp_path / "run"), Config(), None)) is None
+    job = Job(Run(tmp_path / "run"), Config(), None)
+    assert outline_reading.outlines_of(job) is None and outline_reading.outline_points_of(job) is None
