@@ -4,7 +4,8 @@ Where few cameras see a place of the surface, paths know little of how deep it l
 off by that; the silhouettes of the other cameras know. Motion and shape are found by turns: what the surface misses in
 all frames alike is its shape's fault, what it misses in some is the motion's (Cheung, Baker, Kanade,
 Shape-from-silhouette across time, 2005; Gall et al., Motion capture using joint skeleton tracking and surface
-estimation, 2009).
+estimation, 2009). A model of voxels' middles is half a voxel too small: left so, it turns its bodies to meet one side
+of the outlines (those of a man before four cameras by 4.3° instead of 3.4).
 """
 
 from __future__ import annotations

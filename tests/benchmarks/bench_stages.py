@@ -30,7 +30,7 @@ def benchmark() -> list[Row]:
         last = _call("run", root / "capture", run, "--no-pictures")
         timings = json.loads((run / "timings.json").read_text())
     spent = {name: stage["seconds"] for name, stage in timings.items()}
-    inside = [name for name in ("motion", "model", "fit") if name in spent]  # of the segmentation
+    inside = [name for name in ("motion", "model", "outlines") if name in spent]  # of the segmentation
     spent["segmentation"] -= sum(spent[name] for name in inside)
     size = f"{FRAMES} frames × {CAMERAS} cameras {WIDTH}×{HEIGHT}"
     peaks["tracks"] = peaks.pop("track")
