@@ -36,6 +36,7 @@ configure_numba()
 
 if TYPE_CHECKING:
     from geomocap.carving.frames import carve
+    from geomocap.carving.sequence_outlines import find_outlines
     from geomocap.carving.volume import working_volume
     from geomocap.dense.dense_frame import measure_cloud
     from geomocap.evaluation.run_evaluation import evaluate
@@ -44,9 +45,11 @@ if TYPE_CHECKING:
     from geomocap.files.scans import ScanSettings, open_scans
     from geomocap.model.frame_geometry import Voxels
     from geomocap.model.motion_paths import MotionPaths
+    from geomocap.model.outline_points import OutlinePoints
     from geomocap.model.outlines import Outlines
     from geomocap.model.rig import Rig
     from geomocap.motion import Motion, MotionSettings, find_motion
+    from geomocap.outline_refinement import fit_to_outlines
     from geomocap.patches.point_tracking import track
     from geomocap.segmentation.m3 import segment_m3
     from geomocap.silhouettes.silhouette_scene import find_silhouettes
@@ -60,6 +63,7 @@ _HOMES = {  # where each public name is defined
     "Motion": "geomocap.motion",
     "MotionPaths": "geomocap.model.motion_paths",
     "MotionSettings": "geomocap.motion",
+    "OutlinePoints": "geomocap.model.outline_points",
     "Outlines": "geomocap.model.outlines",
     "Rig": "geomocap.model.rig",
     "ScanSettings": "geomocap.files.scans",
@@ -70,7 +74,9 @@ _HOMES = {  # where each public name is defined
     "evaluate": "geomocap.evaluation.run_evaluation",
     "export_run": "geomocap.export.run_export",
     "find_motion": "geomocap.motion",
+    "find_outlines": "geomocap.carving.sequence_outlines",
     "find_silhouettes": "geomocap.silhouettes.silhouette_scene",
+    "fit_to_outlines": "geomocap.outline_refinement",
     "track": "geomocap.patches.point_tracking",
     "follow_model": "geomocap.subject.model_following",
     "measure_cloud": "geomocap.dense.dense_frame",
@@ -86,6 +92,7 @@ __all__ = [
     "Motion",
     "MotionPaths",
     "MotionSettings",
+    "OutlinePoints",
     "Outlines",
     "Rig",
     "ScanSettings",
@@ -97,7 +104,9 @@ __all__ = [
     "evaluate",
     "export_run",
     "find_motion",
+    "find_outlines",
     "find_silhouettes",
+    "fit_to_outlines",
     "follow_model",
     "measure_cloud",
     "open_capture",

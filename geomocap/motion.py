@@ -32,7 +32,7 @@ from geomocap.skeleton.motion_skeleton import (
     find_motion_skeleton,
     joined_apart,
 )
-from geomocap.skeleton.refinement import Further, RefinementSettings, refine_skeleton
+from geomocap.skeleton.refinement import RefinementSettings, refine_skeleton
 from geomocap.trajectories.selection import spread_out
 
 # Motion paths that bodies are found from, were they all over the surface. Of four captures 600, 1,000 and 1,500 found
@@ -110,12 +110,6 @@ class Motion:
     def label(self, frame: int, points: np.ndarray) -> np.ndarray:
         """Bodies (M,) int32 of any points (M, 3), metres, of the surface in a frame."""
         return label_points(self.voters, frame, points)
-
-    def refined(self, settings: RefinementSettings, further: Further, tracks: np.ndarray | None) -> Motion:
-        """Refine bodies and skeleton once more, with further observations; `tracks` as in `with_tracks`, if any."""
-        connected, bodies = refine_skeleton(self.connected, self.bodies, self.paths, settings, further)
-        motion = replace(self, connected=connected, bodies=bodies, voters=Voters.of(bodies, self.paths))
-        return motion if tracks is None else motion.with_tracks(tracks)
 
     def with_tracks(self, tracks: np.ndarray) -> Motion:
         """Let further tracks (N, T, 3), metres, NaN where unseen, help to label points: `labels` are theirs then.

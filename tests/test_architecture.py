@@ -42,6 +42,7 @@ ROOMS: dict[str, set[str]] = {
     # the default method on arrays
     "motion": VALUES | {"bodies", "nodes", "skeleton", "trajectories"},
     "subject": VALUES | {"bodies", "files", "skeleton", "trajectories"},
+    "outline_refinement": VALUES | {"bodies", "motion", "skeleton", "subject"},
     # out of the house
     "naming": VALUES,
     "angles": VALUES | {"naming", "skeleton"},

@@ -33,12 +33,11 @@ from geomocap.model.rig import Rig
 from geomocap.model.self_check import SelfCheck
 from geomocap.scheduling import map_here
 from geomocap.skeleton.kinematics import BodyMotion
-from geomocap.subject.model_mesh import ModelMesh, model_mesh
+from geomocap.subject.model_mesh import DRAWN_TRIANGLES, ModelMesh, model_mesh
 from geomocap.subject.subject_model import MODEL_FILE, SubjectModel, read_model
 from geomocap.subject.window_motion import motion_of
 
 FRAMES = 6  # evenly spread
-MESH_TRIANGLES = 20000
 LONGEST_SIDE = 320  # pixels in which outlines are compared
 # Along the longest side of the hull that is drawn into a camera left out. With 96, 192, 256 and 384 a man whom
 # eight cameras see well overlapped by 0.862, 0.885, 0.891 and 0.896: cells at the border stick out.
@@ -72,7 +71,7 @@ def check_run(run: Run, capture: Capture) -> SelfCheck | None:
 
 def checked_mesh(model: SubjectModel) -> ModelMesh:
     """Return a model's surface as it is compared with silhouettes."""
-    return model_mesh(model, MESH_TRIANGLES)
+    return model_mesh(model, DRAWN_TRIANGLES)
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from geomocap.errors import GeometryError
 from geomocap.evaluation.result_check import SeenOutlines, checked_mesh, model_overlap
 from geomocap.model.frame_geometry import Geometry
 from geomocap.motion import Motion
+from geomocap.outline_refinement import fit_to_outlines
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.outline_reading import outline_points_of
 from geomocap.subject.model_building import BodyCloud, build_model
-from geomocap.subject.outline_fit import OutlineFit
 from geomocap.subject.subject_model import SubjectModel
 from geomocap.subject.window_motion import motion_of
 
@@ -54,21 +54,16 @@ def misfit(motion: Motion, overlap: float) -> float:
 
 
 def fitted_to_outlines(
-    job: Job, model: SubjectModel, motion: Motion, tracks: np.ndarray | None
-) -> tuple[SubjectModel, Motion]:
-    """Refine a motion and the shape of its model so that this ends in the images where the silhouettes do.
-
-    `tracks` as in `Motion.with_tracks`, if any.
-    """
-    rounds = job.config.refinement.outline_rounds
-    outlines = outline_points_of(job) if rounds and job.config.refinement.rounds else None
+    job: Job, motion: Motion, model: SubjectModel, tracks: np.ndarray | None
+) -> tuple[Motion, SubjectModel]:
+    """Refine a motion and its model by the silhouettes of the job, if it has any; see `geomocap.fit_to_outlines`."""
+    settings = job.config.refinement
+    outlines = outline_points_of(job) if settings.outline_rounds and settings.rounds else None
     if outlines is None:
-        return model, motion
+        return motion, model
     with job.run.timed("outlines") as count:
-        fit = OutlineFit(checked_mesh(model), outlines)
-        refined = motion.refined(job.config.refinement.model_copy(update={"rounds": rounds}), fit, tracks)
         count["items"] = outlines.frames
-        return fit.model(model, refined.connected), refined
+        return fit_to_outlines(motion, model, outlines, settings=settings, tracks=tracks)
 
 
 def unseen_frames(motion: Motion) -> list[str]:

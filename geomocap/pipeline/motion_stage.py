@@ -76,7 +76,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     best = candidates[source]
     motion, model = best.motion, best.model
     if not isinstance(model, str):
-        model, motion = fitted_to_outlines(job, model, motion, tracks)
+        motion, model = fitted_to_outlines(job, motion, model, tracks)
     bodies, found = motion.bodies, motion.connected
     warnings = [*camera_warnings(job.run), *motion.warnings, *unseen_frames(motion)]
     label = _Label(geometry, job.run, motion.voters)

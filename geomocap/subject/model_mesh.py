@@ -11,6 +11,7 @@ from geomocap.model.surface import Surface, surface_through
 from geomocap.skeleton.body_observations import SkinPoints
 from geomocap.subject.subject_model import SubjectModel
 
+DRAWN_TRIANGLES = 20_000  # of a model that is drawn to be compared with silhouettes, at most
 NEAREST = 4  # points of the model that give a vertex its weights and colour
 
 

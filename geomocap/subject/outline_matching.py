@@ -21,8 +21,11 @@ from geomocap.skeleton.body_observations import Observations, SkinPoints
 from geomocap.skeleton.kinematics import BodyMotion
 from geomocap.subject.model_mesh import ModelMesh
 
-_GRAZING = 0.35  # cosine between normal and viewing ray up to which a surface may end there
-_BEYOND = 3.0  # pixels outwards from a place of the edge nothing is drawn
+# A surface may end at a vertex up to this cosine between normal and viewing ray, if nothing is drawn so many pixels
+# further outwards. With 0.35 and 3 pixels, vertices within the edge count, and models grow: of a man's silhouettes
+# 3.4 % were drawn beside and 1.1 % not, instead of 2.5 and 1.7; overlap 0.955 instead of 0.959.
+_GRAZING = 0.2
+_BEYOND = 1.5
 _FEWEST = 5  # places of an edge that are matched
 _REACH = 0.05  # of the drawn diagonal up to which edges and outlines are paired
 _TURN = 0.05  # of the drawn diagonal that a difference of directions of one radian counts as

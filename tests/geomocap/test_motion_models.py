@@ -31,13 +31,13 @@ def test_refinement_by_outlines_can_be_left_out(tmp_path, monkeypatch, refinemen
     monkeypatch.setattr(motion_models, "outline_points_of", lambda _: pytest.fail("read"))
     config = Config(refinement=RefinementSettings(**refinement))
     job, model, motion = Job(Run(tmp_path), config, None, capture=object(), fps=30.0), object(), object()
-    assert motion_models.fitted_to_outlines(job, model, motion, None) == (model, motion)
+    assert motion_models.fitted_to_outlines(job, motion, model, None) == (motion, model)
 
 
 def test_scans_have_no_outlines(tmp_path):
     model, motion = object(), object()
     job = Job(Run(tmp_path), Config(), None)
-    assert motion_models.fitted_to_outlines(job, model, motion, None) == (model, motion)
+    assert motion_models.fitted_to_outlines(job, motion, model, None) == (motion, model)
 
 
 def test_frames_in_which_no_path_shows_a_body_are_told():

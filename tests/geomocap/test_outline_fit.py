@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+import geomocap
 from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.bodies.motion_bodies import find_motion_bodies
+from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.outline_points import OutlinePoints, outline_points
 from geomocap.model.ray_casting import TriangleScene
@@ -53,6 +55,12 @@ def drawn(mesh, motion, P):
             found.append(outline_points(hit.astype(np.float32), np.ones((SIZE, SIZE), np.float32), 3))
         frames.append(found)
     return OutlinePoints(P, frames)
+
+
+def distance(mesh, points):
+    """Median distance of points from a surface."""
+    closest = TriangleScene(mesh.skin.rest, mesh.surface.triangles).closest(points)[0]
+    return np.median(np.linalg.norm(closest - points, axis=1))
 
 
 @pytest.fixture(scope="module")
@@ -121,8 +129,23 @@ def test_shape_that_is_too_small_grows(scene):
     after, _ = refine_skeleton(found, bodies, paths, RefinementSettings(rounds=3), fit)
     rebuilt = fit.model(small, after)
     assert rebuilt.body_count == 2 and len(rebuilt.points) == len(small.points)
-    truth = cKDTree(mesh.skin.rest)
-    assert np.median(truth.query(rebuilt.points)[0]) < 0.6 * np.median(truth.query(small.points)[0])
+    assert distance(mesh, rebuilt.points) < 0.4 * distance(mesh, small.points)
+
+
+def test_public_function_refines_motion_and_model(scene):
+    true, _, mesh, outlines, _, read = scene
+    motion = geomocap.find_motion(true.positions, fps=30, bodies=2)
+    model = geomocap.build_model(motion.connected, motion.bodies, read, SPACING)
+    refined, fitted = geomocap.fit_to_outlines(motion, model, outlines, tracks=true.positions)
+    assert refined.body_count == 2 and (refined.labels == motion.labels).mean() > 0.98
+    assert distance(mesh, fitted.points) < 0.004
+    again, _ = geomocap.fit_to_outlines(motion, model, outlines)
+    np.testing.assert_array_equal(again.bodies.rotations, refined.bodies.rotations)
+    none = RefinementSettings(outline_rounds=0)
+    assert geomocap.fit_to_outlines(motion, model, outlines, settings=none) == (motion, model)
+    short = OutlinePoints(outlines.projections, outlines.points[1:])
+    with pytest.raises(GeometryError, match="expected as many"):
+        geomocap.fit_to_outlines(motion, model, short)
 
 
 def test_silhouettes_that_are_missing_say_nothing(scene):
