@@ -62,8 +62,12 @@ def fitted_to_outlines(
     if outlines is None:
         return motion, model
     with job.run.timed("outlines") as count:
+        try:
+            motion, model = fit_to_outlines(motion, model, outlines, settings=settings, tracks=tracks)
+        except GeometryError:
+            return motion, model  # its points make no surface that could be drawn
         count["items"] = outlines.frames
-        return fit_to_outlines(motion, model, outlines, settings=settings, tracks=tracks)
+    return motion, model
 
 
 def unseen_frames(motion: Motion) -> list[str]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from geomocap.config import Config
+from geomocap.errors import GeometryError
 from geomocap.files.run import Run
 from geomocap.pipeline import motion_models
 from geomocap.pipeline.job import Job
@@ -31,6 +32,16 @@ def test_refinement_by_outlines_can_be_left_out(tmp_path, monkeypatch, refinemen
     monkeypatch.setattr(motion_models, "outline_points_of", lambda _: pytest.fail("read"))
     config = Config(refinement=RefinementSettings(**refinement))
     job, model, motion = Job(Run(tmp_path), config, None, capture=object(), fps=30.0), object(), object()
+    assert motion_models.fitted_to_outlines(job, motion, model, None) == (motion, model)
+
+
+def test_a_model_without_a_surface_stays_as_it_was(tmp_path, monkeypatch):
+    def no_surface(*_, **__):
+        raise GeometryError("no surface could be laid through the points")
+
+    monkeypatch.setattr(motion_models, "outline_points_of", lambda _: object())
+    monkeypatch.setattr(motion_models, "fit_to_outlines", no_surface)
+    job, model, motion = Job(Run(tmp_path), Config(), None, capture=object(), fps=30.0), object(), object()
     assert motion_models.fitted_to_outlines(job, motion, model, None) == (motion, model)
 
 
