@@ -125,6 +125,7 @@ def motion_video(
     camera = best_camera(results, stage)
     size = tile_size(stage, 0, 12, 95_000)
     size = (max(size[0], 240), size[1])
+    everywhere = (stage.points[::8] + stage.centers[:: max(1, len(stage.centers) // 16), None]).reshape(-1, 3)
     show_bodies = "bodies" in results.kinds or results.skeleton is None or not results.skeleton.bones
 
     def draw(job: tuple[int, int]) -> np.ndarray:
@@ -140,7 +141,7 @@ def motion_video(
         if bones:
             panels.append(on_paper(picture(results, stage, model, view, frame, look)))
         if camera is not None:
-            drawn = overlay(results, camera, frame, model, 520, 1.0 if bones else 0.7, look)
+            drawn = overlay(results, camera, frame, model, 520, 1.0 if bones else 0.7, look, everywhere)
             panels.append(fit(drawn, (round(size[1] * drawn.shape[1] / drawn.shape[0]), size[1])))
         gap = np.full((size[1], GAP, 3), 255, np.uint8)
         image = np.concatenate([p for panel in panels for p in (panel, gap)][:-1], axis=1)

@@ -14,7 +14,7 @@ from viz.floor import floor
 from viz.rendering import Look, Model, render
 from viz.run_contents import Results
 from viz.shapes import Mesh, frustum
-from viz.viewpoints import PinholeView, ViewStage, camera_view
+from viz.viewpoints import PinholeView, ViewStage, camera_view, shown_size, window_around
 
 VIEWS = {"three-quarter": (35.0, 15.0), "broad side": (0.0, 5.0), "narrow side": (90.0, 5.0), "top": (0.0, 80.0)}
 """Free views: azimuth and elevation, degrees. Broad and narrow refer to the subject, whatever it is."""
@@ -124,19 +124,21 @@ def silhouette_sheet(results: Results, frames: Sequence[int], width: int = 250 *
 
     def row(camera: str) -> list[np.ndarray | None]:
         pictures: list[np.ndarray | None] = []
-        for frame in frames:
-            mask = results.silhouette(camera, frame)
-            if mask is None:
+        masks = {frame: results.silhouette(camera, frame) for frame in frames}
+        left, top, w, h = _subject_window([mask for mask in masks.values() if mask is not None])
+        part = np.s_[top : top + h, left : left + w]
+        for frame, whole in masks.items():
+            if whole is None:
                 pictures.append(None)
                 continue
-            scale = min(1.0, width / max(mask.shape))
-            size = (max(1, round(mask.shape[1] * scale)), max(1, round(mask.shape[0] * scale)))
+            mask = whole[part]
+            size = shown_size((left, top, w, h), whole.shape[::-1], width)
             if results.capture is not None:
-                below = faded(resize(results.capture.frame(camera, frame), size), 0.25)
+                below = faded(resize(results.capture.frame(camera, frame)[part], size), 0.25)
             else:
                 below = np.full((size[1], size[0], 3), 245, np.uint8)
             drawn = outlined(below, mask, (214, 40, 90), 0.30)
-            covered = 100 * float((mask > 127).mean())
+            covered = 100 * float((whole > 127).mean())
             corner = (6 * DENSITY, size[1] - 6 * DENSITY)
             pictures.append(
                 write_on(drawn, f"{covered:.1f} %", corner, 11 * DENSITY, anchor="lb", plate=(255, 255, 255))
@@ -157,6 +159,14 @@ def silhouette_sheet(results: Results, frames: Sequence[int], width: int = 250 *
     return sheet(pairs, (), labels * 2, framed=True)
 
 
+def _subject_window(masks: Sequence[np.ndarray]) -> tuple[int, int, int, int]:
+    """Window of a camera's image around what its silhouettes (H, W) cover together; see `window_around`."""
+    if not masks:
+        return 0, 0, 0, 0
+    covered = np.any([mask > 127 for mask in masks], axis=0)
+    return window_around(np.argwhere(covered)[:, ::-1] + 0.5, covered.shape[::-1])
+
+
 def _named(image: np.ndarray, name: str) -> np.ndarray:
     return write_on(image, name, (7 * DENSITY, 7 * DENSITY), 12 * DENSITY, bold=True, plate=(255, 255, 255))
 
@@ -169,28 +179,30 @@ def overlay(
     longest_side: int = 420,
     opacity: float = 0.85,
     look: Look | None = None,
+    around: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return a model drawn over a camera's image, distortion included: (H, W, 3) uint8."""
+    """Return a model drawn over a camera's image, distortion included: (H, W, 3) uint8; `around`: see `camera_view`."""
     capture = results.capture
     assert capture is not None
-    view = camera_view(capture.rig, capture.rig.names.index(camera), longest_side)
-    photograph = resize(capture.frame(camera, frame), view.size)
+    view = camera_view(capture.rig, capture.rig.names.index(camera), longest_side, around)
+    photograph = resize(view.part_of(capture.frame(camera, frame)), view.size)
     return model.render(view, look).over(faded(photograph, 0.35), opacity)
 
 
 def overlay_sheet(
     results: Results, frames: Sequence[int], build: Builder, opacity: float = 0.85, columns: int = 4
 ) -> np.ndarray | None:
-    """Return geometry drawn over the images of all cameras; None without a calibrated capture."""
+    """Return geometry drawn over the images of all cameras, around it; None without a calibrated capture."""
     capture = results.capture
     if capture is None or not capture.is_calibrated:
         return None
     built = {f: Model(build(results, f)) for f in frames}
+    around = {f: np.concatenate([np.zeros((0, 3)), *(m.vertices for m in model.meshes)]) for f, model in built.items()}
     jobs = [(camera, frame) for frame in frames for camera in capture.cameras]
 
     def tile(job: tuple[str, int]) -> np.ndarray:
         camera, frame = job
-        drawn = overlay(results, camera, frame, built[frame], 340 * DENSITY, opacity, FINE)
+        drawn = overlay(results, camera, frame, built[frame], 340 * DENSITY, opacity, FINE, around[frame])
         return _named(drawn, camera if len(frames) == 1 else f"{camera}, frame {frame}")
 
     with threads() as executor:

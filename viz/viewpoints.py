@@ -15,6 +15,11 @@ import numpy as np
 from geomocap.errors import GeometryError
 from geomocap.model.rig import Rig
 
+_AROUND = 1.5  # of the subject's size in an image, that is shown of it
+_WHOLE = 0.8  # of an image's size from which all of it is shown
+_LEAST = 0.1  # of an image's size that is shown
+_LARGEST = 4.0  # times that a part of an image is enlarged at most
+
 
 class View(Protocol):
     """A picture's size and geometry."""
@@ -76,7 +81,7 @@ class PinholeView:
 
 @dataclass(frozen=True)
 class CameraView:
-    """What a camera of a rig sees, distortion included, at its own or another size.
+    """What a camera of a rig sees, distortion included, or a part of it, at its own or another size.
 
     Attributes
     ----------
@@ -84,32 +89,74 @@ class CameraView:
     camera : int
         Index in the rig.
     size : (int, int)
-        Width and height of the picture, pixels; the camera's image is scaled to it.
+        Width and height of the picture, pixels; what is seen is scaled to it.
+    window : (int, int, int, int)
+        Left, top, width and height of what is seen, pixels of the camera's image.
     """
 
     rig: Rig
     camera: int
     size: tuple[int, int]
+    window: tuple[int, int, int, int]
 
     @property
     def _scale(self) -> np.ndarray:
-        return np.array(self.size, float) / self.rig.sizes[self.camera]
+        return np.array(self.size, float) / self.window[2:]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return pixels (N, 2) of world points (N, 3), NaN behind the view, and depths (N,), metres."""
         one = self.rig.select([self.rig.names[self.camera]])
-        return one.project(points)[0] * self._scale, one.to_camera(np.asarray(points, float))[0, :, 2]
+        pixels = (one.project(points)[0] - self.window[:2]) * self._scale
+        return pixels, one.to_camera(np.asarray(points, float))[0, :, 2]
 
     def rays(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the origin (3,) and unit directions (N, 3), world, of the rays through pixels (N, 2)."""
-        return self.rig.rays(self.camera, np.asarray(pixels, float) / self._scale)
+        return self.rig.rays(self.camera, np.asarray(pixels, float) / self._scale + self.window[:2])
+
+    def part_of(self, image: np.ndarray) -> np.ndarray:
+        """Return what is seen of the camera's image (H, W, …)."""
+        left, top, width, height = self.window
+        return image[top : top + height, left : left + width]
 
 
-def camera_view(rig: Rig, camera: int, longest_side: int | None = None) -> CameraView:
-    """Return the view of a rig's camera, made smaller so that its longest side has `longest_side` pixels at most."""
+def camera_view(rig: Rig, camera: int, longest_side: int | None = None, around: np.ndarray | None = None) -> CameraView:
+    """Return the view of a rig's camera, made smaller so that its longest side has `longest_side` pixels at most.
+
+    `around` (N, 3), metres, world: only what is around these points is shown, where that is much less than the image,
+    and enlarged if it is small.
+    """
     width, height = (int(v) for v in rig.sizes[camera])
-    scale = min(1.0, (longest_side or max(width, height)) / max(width, height))
-    return CameraView(rig, camera, (max(1, round(width * scale)), max(1, round(height * scale))))
+    window = 0, 0, width, height
+    if around is not None and len(around):
+        pixels = rig.select([rig.names[camera]]).project(around)[0]
+        window = window_around(pixels, (width, height))
+    return CameraView(rig, camera, shown_size(window, (width, height), longest_side or max(width, height)), window)
+
+
+def shown_size(window: tuple[int, int, int, int], whole: tuple[int, int], longest_side: int) -> tuple[int, int]:
+    """Return width and height of the picture of a window of an image whose size is `whole`; only parts are enlarged."""
+    most = 1.0 if window[2:] == whole else _LARGEST
+    scale = min(most, longest_side / max(window[2:]))
+    return max(1, round(window[2] * scale)), max(1, round(window[3] * scale))
+
+
+def window_around(pixels: np.ndarray, size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Return left, top, width and height of the part of an image that shows what is around pixels (N, 2).
+
+    It has the image's proportions; the whole image where that is hardly less, or where nothing is seen.
+    """
+    width, height = size
+    seen = pixels[np.isfinite(pixels).all(axis=1)]
+    seen = seen[((seen >= 0) & (seen <= size)).all(axis=1)]
+    if not len(seen):
+        return 0, 0, width, height
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    part = float(np.clip(_AROUND * ((high - low) / size).max(), _LEAST, 1.0))
+    if part > _WHOLE:
+        return 0, 0, width, height
+    w, h = max(1, round(part * width)), max(1, round(part * height))
+    left, top = np.clip(np.rint(0.5 * (low + high) - 0.5 * np.array([w, h])), 0, [width - w, height - h]).astype(int)
+    return int(left), int(top), w, h
 
 
 def up_vector(up: str) -> np.ndarray:

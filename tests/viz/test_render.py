@@ -13,7 +13,7 @@ from geomocap.model.rig import Rig
 from viz.ray_kernels import shade
 from viz.rendering import Layer, Look, Model, render
 from viz.shapes import EMPTY, ball, ellipsoid, tube
-from viz.viewpoints import CameraView, PinholeView, ViewStage, camera_view, look, stage_of
+from viz.viewpoints import CameraView, PinholeView, ViewStage, camera_view, look, stage_of, window_around
 
 UP = np.array([0.0, 0.0, 1.0])
 PLAIN = Look(samples=4, outline=0, hollows=0)
@@ -41,7 +41,7 @@ def cone_mask(view: CameraView, center: np.ndarray, radius: float) -> np.ndarray
 @pytest.mark.parametrize("params", [None, [-0.25, 0.08, 0.002, -0.001]])
 @pytest.mark.parametrize("size", [(120, 90), (60, 45)])
 def test_sphere_covers_its_analytic_projection(params: list[float] | None, size: tuple[int, int]) -> None:
-    view = CameraView(rig(params), 0, size)
+    view = CameraView(rig(params), 0, size, (0, 0, 120, 90))
     center, radius = np.array([0.1, 0.15, 1.05]), 0.35
     seen = render([ball(center, radius, (200, 0, 0), level=24)], view, PLAIN).rgba[..., 3]
     expected = cone_mask(view, center, radius)
@@ -61,6 +61,34 @@ def test_point_projects_where_its_ray_comes_from() -> None:
     back, depth = view.project(origin + 2.5 * directions)
     np.testing.assert_allclose(back, pixels, atol=1e-6)
     assert (depth > 0).all()
+
+
+def test_a_part_of_a_view_is_cut_out_of_the_whole() -> None:
+    cameras = rig([-0.2, 0.05, 0, 0])
+    whole = camera_view(cameras, 0)
+    points = np.array([[0.05, 0.1, 1.05], [0.15, 0.2, 1.0]])
+    part = camera_view(cameras, 0, 240, around=points)
+    left, top, width, height = part.window
+    assert width < whole.size[0] / 2 and part.size == (4 * width, 4 * height)  # enlarged, and no more
+    expected = (whole.project(points)[0] - [left, top]) * 4.0
+    np.testing.assert_allclose(part.project(points)[0], expected, atol=1e-9)
+    pixels = np.array([[3.0, 5.0], [20.0, 30.0]])
+    origin, directions = part.rays(pixels)
+    np.testing.assert_allclose(part.project(origin + 2.0 * directions)[0], pixels, atol=1e-6)
+    image = np.arange(whole.size[0] * whole.size[1]).reshape(whole.size[::-1])
+    assert part.part_of(image).shape == (height, width) and part.part_of(image)[0, 0] == top * whole.size[0] + left
+
+
+def test_windows_keep_the_proportions_and_stay_in_the_image() -> None:
+    size = (400, 300)
+    assert window_around(np.array([[10.0, 20.0], [390.0, 40.0]]), size) == (0, 0, 400, 300)  # hardly less
+    assert window_around(np.zeros((0, 2)), size) == window_around(np.full((3, 2), np.nan), size) == (0, 0, 400, 300)
+    left, top, width, height = window_around(np.array([[0.0, 290.0], [40.0, 300.0]]), size)
+    assert (left, top + height) == (0, 300) and width == 60 and height == 45
+    assert window_around(np.array([[-50.0, 10.0], [100.0, 100.0], [100.0, 100.0]]), size)[2:] == (
+        40,
+        30,
+    )  # one is beside
 
 
 def test_nearer_surface_hides_the_one_behind() -> None:
