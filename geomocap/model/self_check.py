@@ -9,7 +9,9 @@ import numpy as np
 
 Verdict = Literal["trust it", "check it", "don't use it"]
 
-# Model against silhouettes, mean: 0.93 of a right result, 0.72 of limbs merged, 0.65 of silhouettes full of holes
+# Model against silhouettes, mean, the model's shape fitted to them: 0.92 to 0.96 of right results, 0.87 of a stag whose
+# legs were followed badly, 0.85 of a person before four real cameras; but 0.82 to 0.94 where limbs were merged, too.
+# Not fitted: 0.65 of silhouettes full of holes
 GOOD, POOR = 0.8, 0.6
 CONTRADICTS = 0.15  # by which a camera's left-out overlap is below the median camera's: it contradicts the others
 
