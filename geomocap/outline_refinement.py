@@ -42,7 +42,7 @@ def fit_to_outlines(
     Raises
     ------
     GeometryError
-        If the outlines have another number of frames.
+        If the outlines have another number of frames, or the model's points make no surface.
     """
     settings = settings or RefinementSettings()
     frames = len(motion.bodies.rotations)

@@ -56,7 +56,7 @@ def misfit(motion: Motion, overlap: float) -> float:
 def fitted_to_outlines(
     job: Job, motion: Motion, model: SubjectModel, tracks: np.ndarray | None
 ) -> tuple[Motion, SubjectModel]:
-    """Refine a motion and its model by the silhouettes of the job, if it has any; see `geomocap.fit_to_outlines`."""
+    """Refine a motion and its model by the silhouettes of the job; see `geomocap.fit_to_outlines`."""
     settings = job.config.refinement
     outlines = outline_points_of(job) if settings.outline_rounds and settings.rounds else None
     if outlines is None:
@@ -76,5 +76,6 @@ def unseen_frames(motion: Motion) -> list[str]:
     if not hidden.any():
         return []
     return [
-        f"In {hidden.sum()} of {len(hidden)} frames no path shows some body; only silhouettes tell where it is there."
+        f"In {hidden.sum()} of {len(hidden)} frames no path shows some body; there its neighbours and its own motion "
+        "tell where it is, and silhouettes, if any."
     ]

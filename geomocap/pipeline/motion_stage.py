@@ -51,11 +51,11 @@ class _Candidate:
         return np.inf if self.overlap is None else misfit(self.motion, self.overlap)
 
 
-def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
+def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool, has_silhouettes: bool) -> int:
     """Find bodies and skeleton from motion paths, write them, and return the number of frames.
 
     Where there are several kinds of paths, what explains silhouettes and paths best is taken. `has_tracks` is what
-    `motion_paths` takes.
+    `motion_paths` takes; where the run has silhouettes, these refine what was found.
     """
     frames, config = len(geometry), job.config
     choice, tracks = motion_paths(job, geometry, has_tracks)
@@ -75,7 +75,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool) -> int:
     source = min(candidates, key=lambda which: candidates[which].misfit)
     best = candidates[source]
     motion, model = best.motion, best.model
-    if not isinstance(model, str):
+    if has_silhouettes and not isinstance(model, str):
         motion, model = fitted_to_outlines(job, motion, model, tracks)
     bodies, found = motion.bodies, motion.connected
     warnings = [*camera_warnings(job.run), *motion.warnings, *unseen_frames(motion)]

@@ -45,6 +45,7 @@ def segment(job: Job, source: Source) -> str:
         return segment_with_model(job, geometry, source_key)
     by_motion = config.segmentation.method == "motion" and len(geometry) > 1
     has_tracks = by_motion and _is_tracked(job, source)
+    has_silhouettes = by_motion and _has_silhouettes(job, source)
     tables = ("nodes", "motion_bodies", "motion_skeleton", "refinement", "following") if by_motion else ("skeleton",)
     settings = {name: getattr(config, name).model_dump() for name in ("segmentation", *tables)}
     outputs, optional = ["ellipsoids.npz", "bodies", "diagnostics.npz"], [MODEL_FILE, WARNINGS]
@@ -53,9 +54,9 @@ def segment(job: Job, source: Source) -> str:
     windows = job.windows if by_motion else []
     work: Callable[[Job, Geometry], int] = segment_as_m3
     if by_motion:
-        work = partial(segment_by_motion, has_tracks=has_tracks)
+        work = partial(segment_by_motion, has_tracks=has_tracks, has_silhouettes=has_silhouettes)
     if len(windows) > 1:
-        work = partial(segment_windows, windows=windows, has_tracks=has_tracks)
+        work = partial(segment_windows, windows=windows, has_tracks=has_tracks, has_silhouettes=has_silhouettes)
     key = stage_key(
         __name__, "segmentation", source_key, tracks(job) if has_tracks else None, settings, job.fps, windows
     )
@@ -87,6 +88,13 @@ def _is_tracked(job: Job, source: Source) -> bool:
     ):
         return False
     return source != "cloud" or bounds_of(job.capture, job.config.cloud) == "hull"
+
+
+def _has_silhouettes(job: Job, source: Source) -> bool:
+    """Whether silhouettes were made for the geometry: of clouds only where they bound the search."""
+    if job.capture is None:
+        return False
+    return source != "cloud" or bounds_of(job.capture, job.config.cloud) != "none"
 
 
 def segment_as_m3(job: Job, geometry: Geometry) -> int:

@@ -31,7 +31,9 @@ from geomocap.subject.subject_model import MODEL_FILE, read_model
 from geomocap.subject.window_motion import motion_of
 
 
-def segment_windows(job: Job, geometry: Geometry, windows: Sequence[range], has_tracks: bool) -> int:
+def segment_windows(
+    job: Job, geometry: Geometry, windows: Sequence[range], has_tracks: bool, has_silhouettes: bool
+) -> int:
     """Find bodies in one window, follow them through all, write what a segmentation writes; return the frames' number.
 
     Raises
@@ -43,7 +45,7 @@ def segment_windows(job: Job, geometry: Geometry, windows: Sequence[range], has_
     part = job.part(windows[key])
     sound = job.run.sound("segmentation")
     if not {part.run.path / name for name in (SKELETON, MODEL_FILE, DIAGNOSTICS)} <= sound:
-        segment_by_motion(part, GeometryPart(geometry, windows[key]), has_tracks)
+        segment_by_motion(part, GeometryPart(geometry, windows[key]), has_tracks, has_silhouettes)
         if not part.run.has(MODEL_FILE):
             raise GeometryError(
                 f"frames {windows[key].start} to {windows[key].stop - 1}: {' '.join(read_warnings(part.run))} "

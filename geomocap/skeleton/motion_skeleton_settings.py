@@ -44,7 +44,7 @@ class RefinementSettings(Settings):
         description="rounds of shape, and motion with joints; 0: no refinement",
         json_schema_extra={"flag": "refinement"},
     )
-    # Models of thirteen hard captures overlapped the silhouettes by 0.917 without, 0.928 with 3, 0.929 with 5 rounds;
+    # With 6e5b991 models of thirteen hard captures overlapped silhouettes by 0.917 without, 0.928 with 3, 0.929 with 5;
     # rotations were 9.2, 9.1 and 9.3° off on average, joints 2.9 and 2.7 % of the height (0 and 3, ten captures). A
     # person on a treadmill, four real cameras: 0.82, 0.85 and 0.85, eleven joints 73, 66 and 63 mm from the markers.
     outline_rounds: int = Field(

@@ -30,8 +30,8 @@ _FEWEST = 5  # places of an edge that are matched
 _REACH = 0.05  # of the drawn diagonal up to which edges and outlines are paired
 _TURN = 0.05  # of the drawn diagonal that a difference of directions of one radian counts as
 _PIXELS = 1.5  # standard deviation of an outline, at least
-# Fraction of the pairs that err independently of each other. With 0.3 rotations of thirteen hard captures were 9.5°
-# off instead of 9.1 on average, and a person's joints, four real cameras, 64 mm instead of 65.
+# Fraction of the pairs that err independently of each other. With 0.3 (6e5b991) rotations of thirteen hard captures
+# were 9.5° off instead of 9.1 on average, and a person's joints, four real cameras, 64 mm instead of 65.
 _INDEPENDENCE = 0.1
 _ALONG = 1e-3  # weight of distances in the tangent plane: what nothing else tells stays where it is
 _NORMAL = 1.4826  # standard deviations of normal errors in their median

@@ -18,6 +18,7 @@ from geomocap.files.rigs import write_rig
 from geomocap.files.run import Run
 from geomocap.pipeline import Job, clouds, read_cloud_record
 from geomocap.pipeline.cloud_stage import bounds_of, measure_again
+from geomocap.pipeline.segmentation_stage import segment
 from geomocap.pipeline.sources import CloudFrames
 from geomocap.scheduling import threads
 from tests.geomocap.ball import Texture, off_surface, photograph, ring
@@ -62,6 +63,13 @@ def test_one_frame_with_and_without_silhouettes(tmp_path: Path, masks: bool) -> 
     assert again is not None
     again, _ = again
     np.testing.assert_allclose(again.points.positions, points, atol=1e-6)
+
+
+def test_clouds_without_silhouettes_give_bodies(tmp_path: Path) -> None:
+    capture, run = make_capture(tmp_path / "capture", frames=3), Run(tmp_path / "run")
+    with threads(1) as executor:
+        segment(Job(run, load_config(overrides=COARSE), executor, capture=capture, fps=capture.fps), "cloud")
+    assert run.has("skeleton.npz") and not run.has("silhouettes")
 
 
 def test_bounds_are_what_the_capture_allows(tmp_path: Path) -> None:

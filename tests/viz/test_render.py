@@ -85,10 +85,8 @@ def test_windows_keep_the_proportions_and_stay_in_the_image() -> None:
     assert window_around(np.zeros((0, 2)), size) == window_around(np.full((3, 2), np.nan), size) == (0, 0, 400, 300)
     left, top, width, height = window_around(np.array([[0.0, 290.0], [40.0, 300.0]]), size)
     assert (left, top + height) == (0, 300) and width == 60 and height == 45
-    assert window_around(np.array([[-50.0, 10.0], [100.0, 100.0], [100.0, 100.0]]), size)[2:] == (
-        40,
-        30,
-    )  # one is beside
+    beside = np.array([[-50.0, 10.0], [100.0, 100.0], [100.0, 100.0]])  # the first isn't in the image
+    assert window_around(beside, size)[2:] == (40, 30)
 
 
 def test_nearer_surface_hides_the_one_behind() -> None:
