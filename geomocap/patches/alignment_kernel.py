@@ -20,6 +20,10 @@ its template's. So first templates hold a patch while others come and go. Standa
 the normal matrix. What residuals have beyond the noise of the images is what the model of a rigid piece of surface with
 a fixed texture misses, and that goes together over much of a patch: it counts as if only a few of the samples were
 independent.
+
+Noise lowers the correlation of two images, most where their texture is weak. What counts is the correlation of what they
+show, corrected for attenuation: the noise is taken from both variances (Spearman 1904, "The proof and measurement of
+association between two things", American Journal of Psychology 15).
 """
 
 from __future__ import annotations
@@ -35,6 +39,7 @@ from geomocap.patches.patch_templates import LANES, fill_samples, local_camera, 
 
 _FLOOR = 1.0  # noise of an image that even a perfect fit is granted, grey levels
 COHERENT = 0.15  # fraction of the samples over which residuals beyond that go together
+_LEAST_SHOWN = 0.5  # fraction of a variance that is no noise, at least
 _GAIN = 3.0  # most contrast that an image may lose or win against the template
 
 
@@ -71,8 +76,8 @@ def align_patches(
         Arrays of `Patches` and of their store. Steps are limited in units of size.
     use : (N, C) uint8
         Cameras to align with.
-    views : images (C, H, W) float32, masks (C, H, W) uint8, projections (C, 3, 4), centers (C, 3)
-        Arrays of `FrameViews`.
+    views : images (C, H, W) float32, masks (C, H, W) uint8, projections (C, 3, 4), centers (C, 3), noise (C,)
+        Arrays of `FrameViews`; the images' noise as a variance.
     level : int
         Level of the templates.
     stride : int
@@ -86,12 +91,12 @@ def align_patches(
     least_correlation : float
         Cameras below it are left out while better ones are there.
     correlation : (N, C) float
-        Filled: correlation in each camera, −1 where it has no part.
+        Filled: correlation in each camera, free of noise, −1 where it has no part.
     covariance : (N, 6) float
         Filled: variances of shift (m²) and turn (rad²) along the patch's own axes; NaN without solution.
     """
     curvature, size, radius, slots, templates, usable, doubt = patches
-    images, masks, P, centers = views
+    images, masks, P, centers, noise = views
     prior_X, prior_Q, prior_shift, prior_turn = prior
     M = templates.shape[2]
     C, side = use.shape[1], int(math.sqrt(M) + 0.5)
@@ -164,6 +169,9 @@ def align_patches(
                     # no camera says more of the place than was known when its template was taken
                     along = 0.5 * weights[c] * (H[c, 0, 0] + H[c, 1, 1] + H[c, 2, 2])
                     weights[c] /= 1 + along * doubt[n, c] ** 2
+                shown_t = max(variance_t - noise[c], _LEAST_SHOWN * variance_t)
+                shown_now = max(variance - noise[c], _LEAST_SHOWN * variance, 1e-3)
+                now[c] = min(max(product / math.sqrt(shown_now * shown_t), -1.0), 1.0)
                 top = max(top, now[c])
             for c in range(C):
                 if counts[c] == 0:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numba import njit
+from scipy.stats import norm
 
 from geomocap.carving.silhouette_views import PinholeViews
 from geomocap.carving.visibility import SurfaceVoxels, depth_buffers
@@ -18,6 +19,8 @@ from geomocap.model.frame_geometry import Voxels
 _ALL_FACES = 63  # of a voxel: one bit each
 _MARGIN_PX = 2  # pixels by which silhouettes are widened
 _WIDE = 3.0  # blurs; the mean over that is taken away
+_ROUGHNESS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+_SMOOTHEST = 0.25  # fraction of the pixels that tell the noise
 _EMPTY = 1e-3  # fraction of subject under the blur below which a pixel has no value
 
 
@@ -30,6 +33,8 @@ class FrameViews:
     levels : (L, C, H, W) float32
         Grey images without background, blurred, coarsest first. The finest is less its mean over a wider piece: light
         and shade, which are wide, don't turn with the surface, and would pull patches along.
+    noise : (L, C) float64
+        Variance of what is no picture but noise in the levels, grey levels squared.
     masks : (C, H, W) uint8
         1 where the subject is.
     allowed : (C, H, W) uint8
@@ -46,6 +51,7 @@ class FrameViews:
     """
 
     levels: np.ndarray
+    noise: np.ndarray
     masks: np.ndarray
     allowed: np.ndarray
     depth: np.ndarray
@@ -94,12 +100,12 @@ class FrameViews:
         P = views.projections / np.linalg.norm(views.projections[:, 2:, :3], axis=2, keepdims=True)
         P = P * np.sign(np.linalg.det(P[:, :, :3]))[:, None, None]
         P[:, :2] -= 0.5 * P[:, 2:]
-        levels = np.zeros((len(blurs_px), C, H, W), np.float32)
+        levels, noise = np.zeros((len(blurs_px), C, H, W), np.float32), np.zeros(C)
         wide = np.ones((2 * _MARGIN_PX + 1,) * 2, np.uint8)
         allowed, blind = np.empty_like(views.masks), views.blind()  # an empty silhouette has no say
         for c in range(C):
             allowed[c] = cv2.dilate(views.masks[c], wide) | (views.valid[c] == 0) | blind[c]
-            _blur(images[c], views.masks[c], blurs_px, levels[:, c])
+            noise[c] = _blur(images[c], views.masks[c], blurs_px, levels[:, c])
         low = voxels.indices.min(axis=0)
         top = voxels.indices.max(axis=0) + 1 - low
         shape = (int(top[0]), int(top[1]), int(top[2]))
@@ -109,6 +115,7 @@ class FrameViews:
         centers = -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[:, :, 0]
         return cls(
             levels,
+            _noise_kept(blurs_px)[:, None] * noise,
             views.masks,
             allowed,
             depth,
@@ -209,23 +216,51 @@ def _reduced(views: PinholeViews, images: np.ndarray, factor: int) -> tuple[Pinh
     return PinholeViews(views.names, P, masks & valid, valid), small
 
 
-def _blur(image: np.ndarray, mask: np.ndarray, blurs_px: Sequence[float], out: np.ndarray) -> None:
-    """Blur the subject without its background into `out` (L, H, W); 0 far from it."""
+def _blur(image: np.ndarray, mask: np.ndarray, blurs_px: Sequence[float], out: np.ndarray) -> float:
+    """Blur the subject without its background into `out` (L, H, W), 0 far from it; returns the image's noise."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
-        return
+        return 0.0
     margin = int(np.ceil(4 * max(blurs_px))) + 1
     part = (
         slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + margin + 1),
         slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + margin + 1),
     )
     inside = mask[part].astype(np.float32)
-    grey = cv2.cvtColor(np.ascontiguousarray(image[part]), cv2.COLOR_RGB2GRAY).astype(np.float32) * inside
+    grey = cv2.cvtColor(np.ascontiguousarray(image[part]), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    subject = grey * inside
     for level, blur in enumerate(blurs_px):
-        mean, weight = _mean(grey, inside, blur)
+        mean, weight = _mean(subject, inside, blur)
         if level == len(blurs_px) - 1:
-            mean -= _mean(grey, inside, _WIDE * blur)[0]
+            mean -= _mean(subject, inside, _WIDE * blur)[0]
         out[(level, *part)] = np.where(weight > _EMPTY, mean, 0.0)
+    return image_noise(grey, mask[part])
+
+
+def image_noise(grey: np.ndarray, mask: np.ndarray) -> float:
+    """Return the variance of the noise of an image (H, W), grey levels squared, where a mask is not 0.
+
+    Second differences in both directions leave noise and hardly any picture (Immerkær 1996, "Fast noise variance
+    estimation", Computer Vision and Image Understanding 64). Texture adds to them: the smoothest quarter tells.
+    """
+    rough = np.abs(cv2.filter2D(grey, cv2.CV_32F, _ROUGHNESS))[cv2.erode(mask, np.ones((3, 3), np.uint8)) != 0]
+    if not len(rough):
+        return 0.0
+    # grey levels are whole numbers, and so are these: each stands for half a level to both sides
+    counts = np.cumsum(np.bincount(rough.astype(np.int64)))
+    ends = np.append(0.0, np.arange(len(counts)) + 0.5)
+    quantile = np.interp(_SMOOTHEST, np.append(0.0, counts / counts[-1]), ends)
+    return float(quantile / (norm.ppf(0.5 + 0.5 * _SMOOTHEST) * np.linalg.norm(_ROUGHNESS))) ** 2
+
+
+def _noise_kept(blurs_px: Sequence[float]) -> np.ndarray:
+    """Return how much of the variance of an image's noise is left in each level, see `FrameViews`: (L,) float."""
+    side = 2 * int(np.ceil(4 * _WIDE * max(blurs_px))) + 1
+    point = np.zeros((side, side), np.float32)
+    point[side // 2, side // 2] = 1.0
+    spread_out = [cv2.GaussianBlur(point, (0, 0), blur) for blur in blurs_px]
+    spread_out[-1] -= cv2.GaussianBlur(point, (0, 0), _WIDE * blurs_px[-1])
+    return np.array([float((s.astype(np.float64) ** 2).sum()) for s in spread_out])
 
 
 def _mean(grey: np.ndarray, inside: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:

@@ -38,7 +38,7 @@ class PatchAlignment:
     image_sigma : (N,) float
         The same without the depth where a single camera sees the patch.
     by_camera : (N, C) float
-        Correlation in each camera, −1 where it has no part.
+        Correlation in each camera, free of the images' noise, −1 where it has no part.
     """
 
     positions: np.ndarray
@@ -351,7 +351,7 @@ def align(
             Q,
             (*form, patches.slots, patches.store.templates, patches.store.usable, patches.doubt),
             np.ascontiguousarray(use, np.uint8),
-            (view.levels[level], view.masks, view.projections, view.centers),
+            (view.levels[level], view.masks, view.projections, view.centers, view.noise[level]),
             level,
             1 if level == len(view.levels) - 1 else _COARSE_STRIDE,
             level == len(view.levels) - 1,
