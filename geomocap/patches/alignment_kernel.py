@@ -21,9 +21,9 @@ the normal matrix. What residuals have beyond the noise of the images is what th
 a fixed texture misses, and that goes together over much of a patch: it counts as if only a few of the samples were
 independent.
 
-Noise lowers the correlation of two images, most where their texture is weak. What counts is the correlation of what they
-show, corrected for attenuation: the noise is taken from both variances (Spearman 1904, "The proof and measurement of
-association between two things", American Journal of Psychology 15).
+Noise lowers the correlation of two images, most where their texture is weak. What counts is the correlation of what
+they show, corrected for attenuation: the noise is taken from both variances (Spearman 1904, "The proof and measurement
+of association between two things", American Journal of Psychology 15).
 """
 
 from __future__ import annotations

@@ -94,18 +94,19 @@ class FrameViews:
             raise GeometryError(f"images have shape {images.shape}, their silhouettes {views.masks.shape}")
         if not len(voxels.indices):
             raise GeometryError("a frame without surface voxels can't be tracked; carve it again")
+        noise = np.array([_noise_around(i, m, v) for i, m, v in zip(images, views.masks, views.valid, strict=True)])
         if reduction > 1:
             views, images = _reduced(views, images, reduction)
             C, H, W = views.masks.shape
         P = views.projections / np.linalg.norm(views.projections[:, 2:, :3], axis=2, keepdims=True)
         P = P * np.sign(np.linalg.det(P[:, :, :3]))[:, None, None]
         P[:, :2] -= 0.5 * P[:, 2:]
-        levels, noise = np.zeros((len(blurs_px), C, H, W), np.float32), np.zeros(C)
+        levels = np.zeros((len(blurs_px), C, H, W), np.float32)
         wide = np.ones((2 * _MARGIN_PX + 1,) * 2, np.uint8)
         allowed, blind = np.empty_like(views.masks), views.blind()  # an empty silhouette has no say
         for c in range(C):
             allowed[c] = cv2.dilate(views.masks[c], wide) | (views.valid[c] == 0) | blind[c]
-            noise[c] = _blur(images[c], views.masks[c], blurs_px, levels[:, c])
+            _blur(images[c], views.masks[c], blurs_px, levels[:, c])
         low = voxels.indices.min(axis=0)
         top = voxels.indices.max(axis=0) + 1 - low
         shape = (int(top[0]), int(top[1]), int(top[2]))
@@ -115,7 +116,7 @@ class FrameViews:
         centers = -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[:, :, 0]
         return cls(
             levels,
-            _noise_kept(blurs_px)[:, None] * noise,
+            _noise_kept(blurs_px)[:, None] * noise / reduction**2,
             views.masks,
             allowed,
             depth,
@@ -216,38 +217,45 @@ def _reduced(views: PinholeViews, images: np.ndarray, factor: int) -> tuple[Pinh
     return PinholeViews(views.names, P, masks & valid, valid), small
 
 
-def _blur(image: np.ndarray, mask: np.ndarray, blurs_px: Sequence[float], out: np.ndarray) -> float:
-    """Blur the subject without its background into `out` (L, H, W), 0 far from it; returns the image's noise."""
+def _blur(image: np.ndarray, mask: np.ndarray, blurs_px: Sequence[float], out: np.ndarray) -> None:
+    """Blur the subject without its background into `out` (L, H, W); 0 far from it."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
-        return 0.0
+        return
     margin = int(np.ceil(4 * max(blurs_px))) + 1
     part = (
         slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + margin + 1),
         slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + margin + 1),
     )
     inside = mask[part].astype(np.float32)
-    grey = cv2.cvtColor(np.ascontiguousarray(image[part]), cv2.COLOR_RGB2GRAY).astype(np.float32)
-    subject = grey * inside
+    grey = cv2.cvtColor(np.ascontiguousarray(image[part]), cv2.COLOR_RGB2GRAY).astype(np.float32) * inside
     for level, blur in enumerate(blurs_px):
-        mean, weight = _mean(subject, inside, blur)
+        mean, weight = _mean(grey, inside, blur)
         if level == len(blurs_px) - 1:
-            mean -= _mean(subject, inside, _WIDE * blur)[0]
+            mean -= _mean(grey, inside, _WIDE * blur)[0]
         out[(level, *part)] = np.where(weight > _EMPTY, mean, 0.0)
-    return image_noise(grey, mask[part])
 
 
-def image_noise(grey: np.ndarray, mask: np.ndarray) -> float:
-    """Return the variance of the noise of an image (H, W), grey levels squared, where a mask is not 0.
+def _noise_around(image: np.ndarray, mask: np.ndarray, valid: np.ndarray) -> float:
+    """Return the noise of an image (H, W, 3) around its subject: what is behind it is often smoother than itself."""
+    x, y, width, height = cv2.boundingRect(mask)
+    part = slice(y, y + height), slice(x, x + width)
+    if not mask.any():
+        return 0.0
+    return image_noise(cv2.cvtColor(np.ascontiguousarray(image[part]), cv2.COLOR_RGB2GRAY), valid[part])
+
+
+def image_noise(grey: np.ndarray, where: np.ndarray) -> float:
+    """Return the variance of the noise of an image (H, W) uint8, grey levels squared, where a mask is not 0.
 
     Second differences in both directions leave noise and hardly any picture (Immerkær 1996, "Fast noise variance
     estimation", Computer Vision and Image Understanding 64). Texture adds to them: the smoothest quarter tells.
     """
-    rough = np.abs(cv2.filter2D(grey, cv2.CV_32F, _ROUGHNESS))[cv2.erode(mask, np.ones((3, 3), np.uint8)) != 0]
+    rough = np.abs(cv2.filter2D(grey, cv2.CV_16S, _ROUGHNESS))[cv2.erode(where, np.ones((3, 3), np.uint8)) != 0]
     if not len(rough):
         return 0.0
-    # grey levels are whole numbers, and so are these: each stands for half a level to both sides
-    counts = np.cumsum(np.bincount(rough.astype(np.int64)))
+    # these are whole numbers, each stands for half a level to both sides
+    counts = np.cumsum(np.bincount(rough))
     ends = np.append(0.0, np.arange(len(counts)) + 0.5)
     quantile = np.interp(_SMOOTHEST, np.append(0.0, counts / counts[-1]), ends)
     return float(quantile / (norm.ppf(0.5 + 0.5 * _SMOOTHEST) * np.linalg.norm(_ROUGHNESS))) ** 2

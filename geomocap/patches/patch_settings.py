@@ -57,7 +57,9 @@ class TrackingSettings(Settings):
         description="Frames between two looks for surface without patches, the last frame is looked at too; "
         "3 if not given, 10 where single cameras follow the surface",
     )
-    seed_correlation: float = Field(0.85, gt=0, lt=1, description="Least correlation between cameras for a new patch")
+    seed_correlation: float = Field(
+        0.85, gt=0, lt=1, description="Least correlation between cameras for a new patch, free of noise"
+    )
     search_front: float = Field(
         0.0075,
         ge=0,
@@ -70,8 +72,10 @@ class TrackingSettings(Settings):
     # How precise a position is tells more than the correlation, which noise lowers on weak texture. With 0.75 instead
     # of 0.85 patches of a person before four real cameras lasted for 26 frames instead of 20 (median); those of a man
     # in plain clothes before eight drifted by 2.15 mm instead of 2.11 (median), and by 9.3 instead of 9.4 (95 %).
-    correlation: float = Field(0.75, gt=0, lt=1, description="Least mean correlation of a tracked patch")
-    camera_correlation: float = Field(0.6, gt=0, lt=1, description="Least correlation for a camera to count")
+    correlation: float = Field(0.75, gt=0, lt=1, description="Least mean correlation of a tracked patch, free of noise")
+    camera_correlation: float = Field(
+        0.6, gt=0, lt=1, description="Least correlation for a camera to count, free of noise"
+    )
     n_views: int = Field(2, ge=2, description="Least number of cameras that agree on a new patch")
     one_camera_below: float = Field(
         0.5, ge=0, le=1, description="Fraction of the surface on which two cameras agree, below which one alone may do"

@@ -6,9 +6,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
+from geomocap.carving.silhouette_views import PinholeViews
 from geomocap.model.small_systems import inverse_diagonal
 from geomocap.model.trajectories import REASONS
 from geomocap.patches.alignment_kernel import align_patches
+from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.patch_search import renewed
 from geomocap.patches.patch_settings import TrackingSettings
 from geomocap.patches.patch_tracking import track_surface
@@ -19,6 +21,7 @@ from geomocap.patches.seeding import (
     seed_spacing,
     spaced,
     surface_frames,
+    template_room,
 )
 from geomocap.patches.surface_patches import Patches, align, as_one_camera, doubted, with_templates
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
@@ -130,6 +133,27 @@ def test_alignment_finds_the_true_motion_from_a_wrong_start(scene, views, seeds)
     assert np.median(turned) < 1.5
     # the stated precision is that of the measurement: not out by more than a factor of three
     assert 0.3 < np.median(away) / np.median(found.sigma[good] * 1.54) < 3
+
+
+def test_noise_of_the_images_does_not_lower_a_correlation(scene, views, seeds):
+    images, masks = scene.images(0)
+    rng, every = np.random.default_rng(2), np.arange(len(seeds))
+    noisy = [
+        FrameViews.of(
+            PinholeViews.of(scene.projections(), masks),
+            np.clip(np.rint(0.1 * images + 100 + rng.normal(0, 3, (*images.shape[:3], 1))), 0, 255).astype(np.uint8),
+            scene.voxels(0),
+        )
+        for _ in range(2)
+    ]
+    plain = with_templates(seeds.cleared(template_room(noisy[0], TrackingSettings(radius_px=4))), seeds.has, noisy[0])
+    places = plain.positions, plain.frames, plain.has
+    asked = {"iterations": (-1, 0), "least_correlation": 0.0}
+    corrected = align(plain, every, *places, noisy[1], **asked).correlation
+    without = replace(noisy[1], noise=np.zeros_like(noisy[1].noise))
+    lowered = align(plain, every, *places, without, **asked).correlation
+    assert np.median(lowered) < 0.8 < 0.93 < np.median(corrected)
+    assert (corrected >= lowered).all()
 
 
 def test_alignment_keeps_to_its_expectation_where_nothing_is_seen(scene, views, seeds):

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from geomocap.carving.silhouette_views import PinholeViews
 from geomocap.errors import GeometryError
 from geomocap.model.frame_geometry import Voxels
-from geomocap.patches.frame_views import FrameViews
+from geomocap.patches.frame_views import FrameViews, image_noise
 from geomocap.patches.patch_prediction import lift_flow
 from geomocap.patches.surface_patches import facings, visible
 from tests.geomocap.moving_ellipsoid import MovingEllipsoid
@@ -37,6 +37,27 @@ def test_frame_views_have_depth_in_front_of_the_surface_and_no_background(scene,
     rim = (view.masks > 0) & ~np.stack([binary_erosion(m) for m in view.masks])
     inside = (view.masks > 0) & ~rim
     assert abs(view.levels[0][rim].mean() - view.levels[0][inside].mean()) < 8
+
+
+@pytest.mark.parametrize("deviation", [0.7, 2.0, 6.0])
+def test_the_noise_of_the_levels_is_told_from_their_texture(deviation):
+    scene = MovingEllipsoid(texture=20.0)
+    images, masks = scene.images(0)
+    noisy = images + np.random.default_rng(1).normal(0, deviation, images.shape[:3])[..., None]
+    noisy = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+    clean, view = (
+        FrameViews.of(PinholeViews.of(scene.projections(), masks), i, scene.voxels(0)) for i in (images, noisy)
+    )
+    inside = np.stack([binary_erosion(m, iterations=6) for m in masks])
+    for c in range(view.count):
+        added = (view.levels - clean.levels)[:, c, inside[c]].var(axis=1)
+        assert_allclose(np.sqrt(view.noise[1, c]), np.sqrt(added[1]), rtol=0.2)
+        assert view.noise[0, c] < 0.2 * view.noise[1, c]  # wider blur, less noise
+    assert (view.noise > clean.noise).all()
+
+
+def test_an_image_without_a_subject_has_no_noise():
+    assert image_noise(np.full((9, 9), 7, np.uint8), np.zeros((9, 9), np.uint8)) == 0
 
 
 def test_cameras_that_see_patches_are_those_of_the_depths_and_cosines(views):
