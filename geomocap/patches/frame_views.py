@@ -266,9 +266,10 @@ def _noise_kept(blurs_px: Sequence[float]) -> np.ndarray:
     side = 2 * int(np.ceil(4 * _WIDE * max(blurs_px))) + 1
     point = np.zeros((side, side), np.float32)
     point[side // 2, side // 2] = 1.0
-    spread_out = [cv2.GaussianBlur(point, (0, 0), blur) for blur in blurs_px]
-    spread_out[-1] -= cv2.GaussianBlur(point, (0, 0), _WIDE * blurs_px[-1])
-    return np.array([float((s.astype(np.float64) ** 2).sum()) for s in spread_out])
+    blurs = (*blurs_px, _WIDE * blurs_px[-1])
+    spread_out = np.stack([cv2.GaussianBlur(point, (0, 0), blur) for blur in blurs]).astype(np.float64)
+    spread_out[-2] -= spread_out[-1]
+    return np.asarray((spread_out[:-1] ** 2).sum(axis=(1, 2)))
 
 
 def _mean(grey: np.ndarray, inside: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
