@@ -39,7 +39,7 @@ from geomocap.patches.patch_templates import LANES, fill_samples, local_camera, 
 
 _FLOOR = 1.0  # noise of an image that even a perfect fit is granted, grey levels
 COHERENT = 0.15  # fraction of the samples over which residuals beyond that go together
-_LEAST_SHOWN = 0.5  # fraction of a variance that is no noise, at least
+_LEAST_SHOWN = 0.5  # fraction of a variance that counts as no noise, at least; no other value was tried
 _GAIN = 3.0  # most contrast that an image may lose or win against the template
 
 

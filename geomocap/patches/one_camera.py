@@ -68,6 +68,7 @@ def image_precision(patches: Patches, which: np.ndarray, camera: np.ndarray, cor
     patches : Patches
     which, camera : (A,) int
     correlation : (A,) float
+        Free of noise.
     """
     result = np.empty(len(which))
     store = patches.store

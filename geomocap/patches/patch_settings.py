@@ -69,7 +69,7 @@ class TrackingSettings(Settings):
     search_depth: float = Field(
         0.03, ge=0, lt=1, description="How far behind the surface a new patch is looked for (fraction of the diagonal)"
     )
-    # How precise a position is tells more than the correlation, which noise lowers on weak texture. With 0.75 instead
+    # How precise a position is tells more than the correlation. While noise still lowered it, with 0.75 instead
     # of 0.85 patches of a person before four real cameras lasted for 26 frames instead of 20 (median); those of a man
     # in plain clothes before eight drifted by 2.15 mm instead of 2.11 (median), and by 9.3 instead of 9.4 (95 %).
     correlation: float = Field(0.75, gt=0, lt=1, description="Least mean correlation of a tracked patch, free of noise")

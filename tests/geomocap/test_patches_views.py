@@ -51,6 +51,7 @@ def test_the_noise_of_the_levels_is_told_from_their_texture(deviation):
     inside = np.stack([binary_erosion(m, iterations=6) for m in masks])
     for c in range(view.count):
         added = (view.levels - clean.levels)[:, c, inside[c]].var(axis=1)
+        # of a few thousand pixels, which rounding and the rest of the texture make rougher: 16 % at most
         assert_allclose(np.sqrt(view.noise[1, c]), np.sqrt(added[1]), rtol=0.2)
         assert view.noise[0, c] < 0.2 * view.noise[1, c]  # wider blur, less noise
     assert (view.noise > clean.noise).all()
