@@ -85,7 +85,8 @@ class Voters:
         rest: np.ndarray,
         label: np.ndarray,
     ) -> Voters:
-        spacing = float(np.median(PointGrid.of(rest).query(rest, 2)[0][:, 1]))
+        places = np.unique(rest, axis=0)  # samples may share one
+        spacing = float(np.median(PointGrid.of(places).query(places, 2)[0][:, 1]))
         shapes = tuple(PointGrid.of(rest[label == b]) for b in range(bodies.body_count))
         planes = [shape.query(shape.data, min(_PLANE, shape.n))[1].reshape(shape.n, -1) for shape in shapes]
         normals = tuple(plane_normals(shape.data, near) for shape, near in zip(shapes, planes, strict=True))
