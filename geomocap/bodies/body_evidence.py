@@ -92,7 +92,7 @@ def confidence_of(strength: np.ndarray) -> np.ndarray:
     return result
 
 
-# Of two bodies, the lower number first, against each other: turn, radians, and slide, radii of the smaller one
+# Of two bodies, the lower number first, against each other: turn, radians, and slide, radii of the larger one
 Turns = dict[tuple[int, int], tuple[float, float]]
 
 
@@ -275,15 +275,14 @@ def _motion(
 ) -> tuple[float, float]:
     """Turn and slide of two bodies against each other, in the frames that show both.
 
-    They slide by what their motions carry their best common point near the border apart, in radii of the smaller one:
-    by its own size a shield moves beside a trunk. Where single cameras follow the surface it may stand off, and slides
-    then without being another body: there it is 0.
+    They slide by what their motions carry their best common point near the border apart, in radii of the larger one.
+    Where single cameras follow the surface it may stand off, and slides then without being another body: there it is 0.
     """
     turn = _turn(first, second, model, evidence, borders)
     if evidence.ray is not None:
         return turn, 0.0
     miss = parted(first, second, borders.places[first, second], model, criterion, borders)
-    radius = min(_square_radius(evidence.rest[model.label == body]) for body in (first, second))
+    radius = max(_square_radius(evidence.rest[model.label == body]) for body in (first, second))
     return turn, float(np.sqrt(miss / max(radius, 1e-12)))
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from geomocap.bodies.body_settings import FOLLOWED
 from geomocap.bodies.motion_bodies import MotionBodies
 from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths
@@ -85,7 +86,8 @@ class Voters:
         rest: np.ndarray,
         label: np.ndarray,
     ) -> Voters:
-        places = np.unique(rest, axis=0)  # samples may share one
+        alike = FOLLOWED * float(np.linalg.norm(np.ptp(rest, axis=0)))  # voters may lie on one another
+        places = rest[np.unique(np.rint(rest / max(alike, 1e-12)), axis=0, return_index=True)[1]]
         spacing = float(np.median(PointGrid.of(places).query(places, 2)[0][:, 1]))
         shapes = tuple(PointGrid.of(rest[label == b]) for b in range(bodies.body_count))
         planes = [shape.query(shape.data, min(_PLANE, shape.n))[1].reshape(shape.n, -1) for shape in shapes]

@@ -15,7 +15,7 @@ from geomocap.bodies.surface_noise import ring_misses, surface_noise
 from geomocap.errors import GeometryError
 from geomocap.model.motion_paths import MotionPaths
 from geomocap.model.rotations import turn_angles
-from geomocap.motion import unsure_turns
+from geomocap.motion import find_motion, unsure_turns
 from geomocap.skeleton.bone_motion import forward_kinematics
 from geomocap.skeleton.borders import Border
 from geomocap.skeleton.common_points import INDEPENDENT, common_point
@@ -289,6 +289,13 @@ def test_points_of_any_frame_get_the_bodies_of_the_samples(three, found):
         assert labels.dtype == np.int32
         assert (labels == found.label).mean() > 0.95
     assert len(label_points(voters, 0, np.empty((0, 3)))) == 0
+
+
+def test_tracks_may_lie_on_one_another(three):
+    motion = find_motion(np.repeat(three.positions, 2, axis=0), fps=30)
+    once = find_motion(three.positions, fps=30)
+    assert motion.voters.spacing == pytest.approx(once.voters.spacing, rel=0.05)
+    assert same_partition(motion.label(0, three.positions[:, 0]), three.body) > 0.97
 
 
 def test_wrong_paths_are_refused(three):
