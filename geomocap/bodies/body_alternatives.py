@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geomocap.bodies.body_criterion import Criterion
-from geomocap.bodies.body_evidence import Candidate, fitted, noise_of, observed, of_required, only_seen
+from geomocap.bodies.body_evidence import Candidate, fitted, gross, noise_of, observed, of_required, only_seen
 from geomocap.bodies.body_joints import Borders, held_together, neighbours_of
 from geomocap.bodies.body_model import BodyModel, Evidence, reassign, refit, settle_rest
 
@@ -87,7 +87,8 @@ def without(candidate: Candidate, model: BodyModel, evidence: Evidence, criterio
         best = _missed(some, model, before, model.adjacent(before.adjacency), np.array([one]))
         other = _missed(some, left, after, adjacent, neighbours if one == body else np.array([], int))
         noise = noise_of(some, other.main, other.partner, other.fraction, left, after, criterion, left_borders)
-        gain = np.log((noise + other.squares) / (noise + more * best.squares))
+        most = gross(noise, some, evidence, criterion)
+        gain = np.log((noise + np.minimum(other.squares, most)) / (noise + np.minimum(more * best.squares, most)))
         if one == body:
             gain = np.maximum(gain, 0.0)
             own = observations

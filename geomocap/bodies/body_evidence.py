@@ -14,6 +14,12 @@ blend of them: a fixed fraction of how far they turn it apart, but no more than 
 What turns it apart is a joint in its midst. Trunk and shank have none in a thigh: what their motions carry even their
 best common point apart is not counted, and the thigh is no soft skin of both.
 
+Paths that went astray move with nothing, and any body misses them by a little less than the others do. What misses a
+sample by r is no explanation where the sample might as well be anywhere in the scene, of diagonal D: a normal law of s
+in each direction is below the uniform one, 1 / D³, from r² = 6 s² ln(D / s) on, at 6 or 7 s. Skin amid two bodies that
+turn just not enough against each other follows either but for half of that turn, which comes to r². Misses beyond
+count as r.
+
 Nor do joints come free. Without the thigh, trunk and shank would have to meet in a joint, or the shank has as many
 freedoms more as the thigh has. So to what a body explains of its samples comes what it adds to the likelihood of the
 joints: they part by a mean square p with it and by q without, and of each that it makes needless
@@ -40,6 +46,7 @@ import numpy as np
 from geomocap.bodies.body_criterion import Criterion
 from geomocap.bodies.body_joints import Borders, held_together, motion_known, neighbours_of, parted, parting
 from geomocap.bodies.body_model import BodyModel, Evidence
+from geomocap.bodies.body_settings import FOLLOWED
 from geomocap.bodies.rigid_motions import relative_turn
 from geomocap.bodies.skin_blending import blend_spans
 
@@ -196,8 +203,17 @@ def _explained(
     missed, partner, fraction = found.costs[row, main], found.partner[row, main], found.fraction[row, main]
     noise = noise_of(some, main, partner, fraction, model, evidence, criterion, borders)
     # what was fitted to few independent observations leaves less than they really miss
-    gain = np.maximum(np.log((noise + missed) / (noise + fitted(observations) * own)), 0.0)
+    most = gross(noise, some, evidence, criterion)
+    gain = np.log((noise + np.minimum(missed, most)) / (noise + np.minimum(fitted(observations) * own, most)))
+    gain = np.maximum(gain, 0.0)
     return 0.5 * observations * float(gain.mean()), float(own.mean())
+
+
+def gross(noise: np.ndarray, some: np.ndarray, evidence: Evidence, criterion: Criterion) -> np.ndarray:
+    """Mean squares of misses from which on they are gross errors, (n,), metres², of samples (n,) with so much noise."""
+    diagonal = evidence.noise / FOLLOWED
+    by_noise: np.ndarray = 6.0 * noise * np.log(np.maximum(diagonal / np.sqrt(noise), math.e))
+    return by_noise + _of_least_turn(some, evidence, criterion) / 4.0
 
 
 def fitted(observations: float) -> float:
@@ -222,10 +238,14 @@ def noise_of(
     noise: np.ndarray = np.maximum(criterion.noise.variance, stated)
     if criterion.softness > 0:
         apart = _turned_apart(some, main, partner, model, evidence, criterion, borders)
-        # a swing of the least turn to and fro moves what lies around its middle by the mean square a² r² / 3
         soft = 4.0 * fraction * (1.0 - fraction) * criterion.softness**2 * apart
-        noise += np.minimum(soft, criterion.min_turn**2 / 3.0 * _square_radius(evidence.rest[some]))
+        noise += np.minimum(soft, _of_least_turn(some, evidence, criterion))
     return noise
+
+
+def _of_least_turn(some: np.ndarray, evidence: Evidence, criterion: Criterion) -> float:
+    """Mean square by which a swing of the least turn moves samples around their middle: a² r² / 3, metres²."""
+    return criterion.min_turn**2 / 3.0 * _square_radius(evidence.rest[some])
 
 
 def _turned_apart(
