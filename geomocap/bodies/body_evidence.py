@@ -32,7 +32,8 @@ What touches a body and turns as it does may still move otherwise, if nothing jo
 before a helmet. So to a turn comes how far the motions of both carry their best common point apart, as far as that is
 more than with the neighbour that the body hangs on: skin and folds of cloth slide a little against all of them, and
 as far as small pieces of them are wide. Neither explains much: what is sure beyond doubt may slide on what it hangs on,
-as pistons do, and a small body along a large one. Where depths are unsure, sliding tells nothing.
+and a small body along a large one. Where depths are unsure, sliding tells nothing. What only slides and turns in no way
+isn't found: first groups are made of turns.
 """
 
 from __future__ import annotations

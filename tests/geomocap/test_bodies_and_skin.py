@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from geomocap.bodies.body_settings import MotionBodiesSettings
 from geomocap.bodies.motion_bodies import find_motion_bodies
 from geomocap.model.motion_paths import MotionPaths
-from tests.geomocap.moving_chains import chain, same_partition
+from tests.geomocap.moving_chains import box_surface, chain, same_partition
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +37,9 @@ def test_soft_skin_is_no_body_of_its_own():
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_deep_soft_skin_between_three_bodies_is_no_fourth(seed):
-    three = chain(3, samples=200, turn_deg=50.0, seed=seed)
+    three = chain(3, samples=200, turn_deg=70.0, seed=seed)
     rest = three.positions[:, 0]
-    up, down = (np.clip((rest[:, 0] - joint + 0.2) / 0.4, 0.0, 1.0) for joint in (0.4, 0.8))
+    up, down = (np.clip((rest[:, 0] - joint + 0.25) / 0.5, 0.0, 1.0) for joint in (0.4, 0.8))
     up, down = (fraction**2 * (3.0 - 2.0 * fraction) for fraction in (up, down))
     weights = np.stack([1 - up, up * (1 - down), up * down], axis=1)
     weights /= weights.sum(axis=1, keepdims=True)
@@ -141,3 +141,18 @@ def test_paths_that_go_astray_are_no_body(seed):
     wandering = gaussian_filter1d(rng.normal(size=(len(astray) + 1, 24, 3)), 4.0, axis=1)
     positions[astray] += 0.03 * (wandering[1:] + wandering[:1]) / (np.sqrt(2.0) * wandering.std())
     assert find_motion_bodies(MotionPaths(positions)).body_count == 3
+
+
+def test_a_small_body_that_slides_along_a_large_one_is_one():
+    """A slide on a beam: it turns by less than a body must, and the beam is all that it hangs on."""
+    rng, phase = np.random.default_rng(0), 2.0 * np.pi * np.arange(30) / 30
+    beam = box_surface(rng, 300, [0.0, -0.06, -0.05], [1.2, 0.06, 0.05])
+    rider = box_surface(rng, 100, [0.5, -0.04, 0.05], [0.62, 0.04, 0.13])
+    turns = Rotation.from_euler("z", 12.0 * np.sin(phase)[:, None], degrees=True).as_matrix()
+    middle = rider.mean(axis=0)
+    moved = np.einsum("tij,nj->nti", turns, rider - middle) + middle
+    moved[..., 0] += 0.1 * np.sin(phase)
+    positions = np.concatenate([np.repeat(beam[:, None], 30, axis=1), moved])
+    bodies = find_motion_bodies(MotionPaths(positions + rng.normal(scale=1e-3, size=positions.shape)))
+    assert bodies.body_count == 2
+    assert same_partition(bodies.label, np.repeat([0, 1], [len(beam), len(rider)])) > 0.97
