@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from geomocap.errors import SettingsError
 from geomocap.scheduling import threads
 
+_PATIENCE = "10s"  # for a scheduler to answer
+
 
 @contextmanager
 def executor_for(workers: int | None, scheduler: str | None) -> Iterator[Executor]:
@@ -22,7 +24,7 @@ def executor_for(workers: int | None, scheduler: str | None) -> Iterator[Executo
     except ImportError:
         raise SettingsError("--scheduler needs Dask: pip install 'geomocap[dask]'") from None
     try:
-        client = Client(scheduler, timeout="10s")
+        client = Client(scheduler, timeout=_PATIENCE)
     except (OSError, ValueError) as error:
         raise SettingsError(f"--scheduler {scheduler}: no Dask scheduler answers there ({error})") from None
     with client, client.get_executor() as executor:

@@ -223,8 +223,9 @@ def test_run_folder_must_not_hold_the_capture(capture, geomocap):
     assert "choose another folder" in refused(geomocap("run", capture, capture.parent, check=False))
 
 
-def test_no_dask_scheduler(capture, geomocap, tmp_path):
+def test_no_dask_scheduler(capture, geomocap, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
+    monkeypatch.setattr("geomocap.cli.execution._PATIENCE", "1s")
     said = refused(geomocap("run", capture, tmp_path / "run", "--scheduler", "tcp://127.0.0.1:1", check=False))
     assert "no Dask scheduler answers" in said
 

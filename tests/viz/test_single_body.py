@@ -59,7 +59,7 @@ def test_a_single_body_turns_in_its_report(single: Run) -> None:
 
 
 def test_a_single_body_has_its_motion_rate_and_duration_in_the_page(single: Run) -> None:
-    files = review(single)
+    files = review(single, quick=True)
     page = files[-1].read_text(encoding="utf-8")
     assert "has no skeleton" not in page and "one rigid body, so it has no joints" in page
     assert '<script type="application/json"' in page and "motion" in {f.stem for f in files if f.suffix == ".png"}
