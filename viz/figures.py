@@ -12,7 +12,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import TightLayoutEngine
 
 from geomocap.model.ellipsoids import Ellipsoids
 from geomocap.model.rotations import rotation_vectors
@@ -54,6 +53,7 @@ def plot(draw: Callable[P, Figure]) -> Callable[P, bytes]:
     def styled(*args: P.args, **kwargs: P.kwargs) -> bytes:
         with _ONE_AT_A_TIME, matplotlib.rc_context(STYLE):
             figure = draw(*args, **kwargs)
+            figure.tight_layout()  # one pass; layout="tight" takes two, to the same picture
             buffer = io.BytesIO()
             FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
             return buffer.getvalue()
@@ -65,8 +65,7 @@ def plot(draw: Callable[P, Figure]) -> Callable[P, bytes]:
 
 def figure_of(width: float, height: float) -> Figure:
     """Return an empty figure, sizes in inches."""
-    one_pass = TightLayoutEngine(rect=None)  # "tight" takes two to the same picture
-    return Figure(figsize=(width, height), dpi=100 * DENSITY, layout=one_pass)
+    return Figure(figsize=(width, height), dpi=100 * DENSITY)
 
 
 def times_axis(count: int, fps: float | None) -> tuple[np.ndarray, str]:
