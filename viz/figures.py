@@ -53,7 +53,8 @@ def plot(draw: Callable[P, Figure]) -> Callable[P, bytes]:
     def styled(*args: P.args, **kwargs: P.kwargs) -> bytes:
         with _ONE_AT_A_TIME, matplotlib.rc_context(STYLE):
             figure = draw(*args, **kwargs)
-            figure.tight_layout()  # one pass; layout="tight" takes two, to the same picture
+            if figure.get_layout_engine() is None:
+                figure.tight_layout()  # one pass; layout="tight" takes two, to the same picture
             buffer = io.BytesIO()
             FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
             return buffer.getvalue()
