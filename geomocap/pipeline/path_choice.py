@@ -87,6 +87,32 @@ def motion_paths(job: Job, geometry: Geometry, has_tracks: bool) -> tuple[dict[s
     return {"pieces": _joined(patches, held, rest[spread_out(held.positions[rest], spacing)])}, tracks
 
 
+def carrying_tracks(job: Job, geometry: Geometry, has_tracks: bool) -> np.ndarray | None:
+    """Tracks that carry the ellipsoids of M3, (N, T, 3), metres, NaN where unseen; None: none are asked for.
+
+    Parameters
+    ----------
+    job : Job
+    geometry : Geometry
+    has_tracks : bool
+        Whether the surface was tracked in the job's images.
+
+    Raises
+    ------
+    GeometryError
+        If patches or points are asked for and there are none.
+    """
+    wanted = job.config.segmentation.paths
+    if wanted != "patches":
+        return _point_tracks(job, geometry) if wanted == "points" else None
+    tracks = _tracks_of_several(read_trajectories(job.run)) if has_tracks else None
+    if tracks is None:
+        raise GeometryError(
+            f"{job.run.path}: no surface patches could be followed in the images; set segmentation.paths = auto"
+        )
+    return tracks
+
+
 def _tracks_of_several(tracked: Trajectories) -> np.ndarray | None:
     """Positions of trajectories that no single camera placed, (N, T, 3), metres; None: there are none."""
     lasting = tracked.lengths >= max(2, SHORT_FRACTION * tracked.n_frames)

@@ -25,6 +25,7 @@ from geomocap.pipeline.derived import FROM_BODIES
 from geomocap.pipeline.following_stage import segment_with_model
 from geomocap.pipeline.job import Job
 from geomocap.pipeline.motion_stage import segment_by_motion
+from geomocap.pipeline.path_choice import carrying_tracks
 from geomocap.pipeline.sources import Source, geometry_of
 from geomocap.pipeline.track_stage import tracks
 from geomocap.pipeline.window_stage import segment_windows
@@ -44,7 +45,8 @@ def segment(job: Job, source: Source) -> str:
     if job.model is not None:
         return segment_with_model(job, geometry, source_key)
     by_motion = config.segmentation.method == "motion" and len(geometry) > 1
-    has_tracks = by_motion and _is_tracked(job, source)
+    carried = config.segmentation.paths == "patches" and len(geometry) > 1  # ellipsoids of M3, by patches
+    has_tracks = (by_motion or carried) and _is_tracked(job, source)
     has_silhouettes = by_motion and _has_silhouettes(job, source)
     tables = ("nodes", "motion_bodies", "motion_skeleton", "refinement", "following") if by_motion else ("skeleton",)
     settings = {name: getattr(config, name).model_dump() for name in ("segmentation", *tables)}
@@ -52,7 +54,7 @@ def segment(job: Job, source: Source) -> str:
     # a single frame has no motion to tell bodies and joints by
     (outputs if len(geometry) > 1 else optional).append("skeleton.npz")
     windows = job.windows if by_motion else []
-    work: Callable[[Job, Geometry], int] = segment_as_m3
+    work: Callable[[Job, Geometry], int] = partial(segment_as_m3, has_tracks=has_tracks)
     if by_motion:
         work = partial(segment_by_motion, has_tracks=has_tracks, has_silhouettes=has_silhouettes)
     if len(windows) > 1:
@@ -97,14 +99,18 @@ def _has_silhouettes(job: Job, source: Source) -> bool:
     return source != "cloud" or bounds_of(job.capture, job.config.cloud) != "none"
 
 
-def segment_as_m3(job: Job, geometry: Geometry) -> int:
-    """Follow the paper: ellipsoids, bodies from their paths, joints by growing samples; return the frames' number."""
+def segment_as_m3(job: Job, geometry: Geometry, has_tracks: bool = False) -> int:
+    """Follow the paper: ellipsoids, bodies from their paths, joints by growing samples; return the frames' number.
+
+    Ellipsoids are carried by tracks where `segmentation.paths` names some (`carrying_tracks`).
+    """
     frames = len(geometry)
     found = segment_m3(
         geometry.points,
         frames,
         spacing=geometry.spacing,
         settings=job.config.segmentation,
+        tracks=carrying_tracks(job, geometry, has_tracks) if frames > 1 else None,
         executor=job.executor,
         progress=job.progress,
     )

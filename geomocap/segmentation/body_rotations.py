@@ -6,9 +6,42 @@ import numpy as np
 
 from geomocap.model.ellipsoids import SHELL, Ellipsoids
 from geomocap.model.rotations import nearest_rotation
+from geomocap.segmentation.carried_ellipsoids import EllipsoidMotion
 
 _AXES = 1.0
 _INERTIA = 0.3
+
+
+def carried_bodies(
+    ellipsoids: Ellipsoids, body: np.ndarray, motion: EllipsoidMotion, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """How bodies move if each of their ellipsoids carries its points by its own motion.
+
+    Parameters
+    ----------
+    ellipsoids : Ellipsoids (T, K)
+    body : (K,) int
+        Body of each ellipsoid.
+    motion : EllipsoidMotion
+    count : int
+        Number of bodies B.
+
+    Returns
+    -------
+    rotations : (T, B, 3, 3) float
+        Those nearest (Kabsch) to where the points come to be; the identity in frame 0.
+    positions : (T, B, 3) float, metres, world
+        Of their centres.
+    """
+    weights = (body == np.arange(count)[:, None]) * ellipsoids.counts[0].astype(float)
+    weights /= weights.sum(axis=1, keepdims=True)
+    axes, centers = ellipsoids.rotations[0], motion.centers
+    spread = np.einsum("kij,kj,klj->kil", axes, ellipsoids.radii[0] ** 2 / SHELL, axes)
+    turned = np.einsum("bk,tkij,kjl->tbil", weights, motion.rotations, spread)
+    means = np.einsum("bk,tki->tbi", weights, centers)
+    apart = np.einsum("bk,tki,kj->tbij", weights, centers, motion.rest)
+    apart -= np.einsum("tbi,bj->tbij", means, means[0])
+    return nearest_rotation(turned + apart), means
 
 
 def body_rotations(ellipsoids: Ellipsoids, body: np.ndarray, bodies: Ellipsoids) -> np.ndarray:

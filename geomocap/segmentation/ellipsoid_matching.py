@@ -12,6 +12,7 @@ from scipy.spatial.distance import cdist
 
 from geomocap.errors import GeometryError
 from geomocap.model.ellipsoids import Ellipsoids, from_moments, union_errors
+from geomocap.segmentation.carried_ellipsoids import Carrier, EllipsoidMotion, Guide
 from geomocap.segmentation.contacts import count_contacts
 from geomocap.segmentation.ellipsoid_assignment import assign, match_cost
 from geomocap.segmentation.ellipsoid_merging import merge_frame
@@ -19,6 +20,7 @@ from geomocap.segmentation.ellipsoid_splitting import SplitFrame, split_points
 from geomocap.segmentation.m3_settings import SegmentationSettings
 
 _CONTACTS_EVERY = 4
+_ELSEWHERE = 1e6  # what it costs, spacings, to go where none of an ellipsoid's tracked points does
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,8 @@ class EllipsoidPaths:
         Fraction of every fourth frame in which two ellipsoids touch.
     repaired : (T,) int32
         Ellipsoids that were split because several were matched to them; 0 in the first frame.
+    motion : EllipsoidMotion, optional
+        How tracked points carry them.
     """
 
     ellipsoids: Ellipsoids
@@ -44,6 +48,7 @@ class EllipsoidPaths:
     contacts: np.ndarray
     touching: np.ndarray
     repaired: np.ndarray
+    motion: EllipsoidMotion | None = None
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -105,6 +110,12 @@ class _Sets:
         for k in range(self.count):
             labels[self.begin[k] : self.end[k]] = sets[k]
         return labels
+
+    def of_points(self) -> np.ndarray:
+        """Set of each of the points in the order in which they were given."""
+        sets = np.empty(len(self.points), np.int32)
+        sets[self.order] = self.labels(np.arange(self.count))
+        return sets
 
 
 @dataclass(frozen=True)
@@ -171,7 +182,12 @@ def first_frame(split: SplitFrame, settings: SegmentationSettings) -> MatchedFra
 
 
 def match_frame(
-    before: MatchedFrame, split: SplitFrame, settings: SegmentationSettings, frame: int = 0, touch: bool = True
+    before: MatchedFrame,
+    split: SplitFrame,
+    settings: SegmentationSettings,
+    frame: int = 0,
+    touch: bool = True,
+    guide: Guide | None = None,
 ) -> MatchedFrame:
     """Match the K ellipsoids of a frame to the leaves of the next, and make these K as well (section 6, figure 3).
 
@@ -186,6 +202,9 @@ def match_frame(
         Number of frame t + 1, for errors.
     touch : bool
         Whether to count contacts.
+    guide : Guide, optional
+        What tracked points say: an ellipsoid is looked for where they carry it, and among the leaves that hold some of
+        its own; a leaf without a partner goes to the ellipsoid of which it holds most.
 
     Returns
     -------
@@ -199,11 +218,20 @@ def match_frame(
     """
     count = len(before.moments)
     old, old_counts = before.centers - split.origin / split.spacing, before.moments[:, 0]
+    if guide is not None:
+        old = (guide.centers - split.origin) / split.spacing
     sets = _Sets(split, 4 * count)
     repaired = 0
+
+    def costs() -> np.ndarray:
+        cost = match_cost(old, old_counts, sets.centers, sets.counts, settings.size_weight)
+        if guide is None:
+            return cost
+        votes = guide.votes(sets.of_points(), sets.count)
+        return np.where((votes > 0) | ~votes.any(axis=1, keepdims=True), cost, cost + _ELSEWHERE)
+
     while True:
-        new = sets.centers
-        cost = match_cost(old, old_counts, new, sets.counts, settings.size_weight)
+        new, cost = sets.centers, costs()
         target = assign(cost, old, new, settings.coherence_weight)
         # Duplicated ellipsoids: split them and assign again
         duplicated = np.flatnonzero(np.bincount(target) > 1)
@@ -221,14 +249,19 @@ def match_frame(
                 "first frame; check this frame's geometry, or leave it out"
             )
         new = sets.centers
-        target = linear_sum_assignment(match_cost(old, old_counts, new, sets.counts, settings.size_weight))[1]
+        target = linear_sum_assignment(costs())[1]
     # Missing correspondences: merge the ellipsoid into the nearest matched one
     partner = cdist(new, new[target]).argmin(axis=1).astype(np.int32)
+    if guide is not None:
+        votes = guide.votes(sets.of_points(), sets.count)
+        partner = np.where(votes.any(axis=0), votes.argmax(axis=0), partner).astype(np.int32)
     partner[target] = np.arange(count)
     return MatchedFrame.of(split, sets, partner, count, repaired, touch)
 
 
-def match_frames(splits: Iterable[SplitFrame], settings: SegmentationSettings) -> EllipsoidPaths:
+def match_frames(
+    splits: Iterable[SplitFrame], settings: SegmentationSettings, tracks: np.ndarray | None = None
+) -> EllipsoidPaths:
     """Merge the first frame and match all others along the sequence, two frames at a time.
 
     Parameters
@@ -236,6 +269,8 @@ def match_frames(splits: Iterable[SplitFrame], settings: SegmentationSettings) -
     splits : iterable of SplitFrame
         The frames in order; each is let go after the next.
     settings : SegmentationSettings
+    tracks : (N, T, 3) float, optional
+        Points of the surface that were tracked, metres, world; NaN where not seen. They carry the ellipsoids.
 
     Raises
     ------
@@ -244,14 +279,20 @@ def match_frames(splits: Iterable[SplitFrame], settings: SegmentationSettings) -
     """
     frames, labels, repaired = [], [], []
     current: MatchedFrame | None = None
+    carrier = None if tracks is None else Carrier(tracks)
     for number, split in enumerate(splits):
         if current is None:
             current = first_frame(split, settings)
+            if carrier is not None:
+                carrier.begin(current.ellipsoids.centers, split, current.labels)
             looks = 0
             contacts = np.zeros((len(current.moments),) * 2)
             touching = np.zeros(contacts.shape)
         else:
-            current = match_frame(current, split, settings, number, number % _CONTACTS_EVERY == 0)
+            guide = None if carrier is None else carrier.guide(split)
+            current = match_frame(current, split, settings, number, number % _CONTACTS_EVERY == 0, guide)
+            if carrier is not None:
+                carrier.adopt(split, current.labels)
         frames.append(current.ellipsoids)
         labels.append(current.labels)
         repaired.append(current.repaired)
@@ -267,4 +308,5 @@ def match_frames(splits: Iterable[SplitFrame], settings: SegmentationSettings) -
         contacts / looks,
         touching / looks,
         np.array(repaired, np.int32),
+        None if carrier is None else carrier.motion(),
     )

@@ -8,10 +8,10 @@ from functools import partial
 
 import numpy as np
 
-from geomocap.errors import GeometryError
+from geomocap.errors import GeometryError, SettingsError
 from geomocap.progress import Progress, silent
 from geomocap.scheduling import map_items
-from geomocap.segmentation.body_rotations import body_rotations
+from geomocap.segmentation.body_rotations import body_rotations, carried_bodies
 from geomocap.segmentation.contacts import contacts_of_bodies
 from geomocap.segmentation.ellipsoid_matching import EllipsoidPaths, match_frames
 from geomocap.segmentation.ellipsoid_splitting import SplitFrame, split_frame
@@ -33,10 +33,15 @@ def segment_m3(
     *,
     spacing: float,
     settings: SegmentationSettings | None = None,
+    tracks: np.ndarray | None = None,
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> Segmentation:
     """Divide a sequence of points into ellipsoids and rigid bodies.
+
+    The ellipsoids of independently split frames slide on the surface. If points of it were tracked, these carry the
+    ellipsoids: matching looks for each where its tracked points lead, and paths and turns are theirs
+    (`carried_ellipsoids`). Everything else is the paper's.
 
     Parameters
     ----------
@@ -47,6 +52,8 @@ def segment_m3(
     spacing : float, metres
         Voxel size, or the mean distance of a point from its nearest neighbour.
     settings : SegmentationSettings, optional
+    tracks : (N, T, 3) float, optional
+        Points that were tracked on the surface, metres, world; NaN where not seen.
     executor : Executor, optional
         Maps the split stage over the frames; needs picklable `points` if it runs in other processes.
     progress : Progress, optional
@@ -59,20 +66,29 @@ def segment_m3(
     Raises
     ------
     GeometryError
-        If there are no frames, the spacing is not positive, or a frame is empty, too small or not finite; the frame
-        is named.
+        If there are no frames, the spacing is not positive, tracks have other frames, or a frame is empty, too small
+        or not finite; the frame is named.
+    SettingsError
+        If tracks are given for the iterative variant, which takes volumes apart.
     """
     settings = settings or SegmentationSettings()
     points, frames = _checked(points, frames, spacing)
+    if tracks is not None and tracks.shape[1:] != (frames, 3):
+        raise GeometryError(f"tracks have shape {tracks.shape}, expected (N, {frames}, 3): one position a frame")
+    if tracks is not None and settings.iterative:
+        raise SettingsError(
+            "segmentation.iterative takes volumes apart and follows no tracks; leave out one of the two"
+        )
 
     def follow(some: Points, some_progress: Progress = silent) -> EllipsoidPaths:
         return ellipsoid_paths(some, frames, spacing, settings, executor, some_progress)
 
     # Ellipsoids of every frame, and their paths (sections 5 and 6)
-    paths = follow(points, progress)
+    paths = ellipsoid_paths(points, frames, spacing, settings, executor, progress, tracks)
     # Rigid bodies by relative paths (section 7)
-    integrals = path_integrals(paths.ellipsoids.centers)
-    threshold = max(similarity_threshold(integrals, settings.body_deviations), _STILL * spacing)
+    motion = paths.motion
+    integrals = path_integrals(paths.ellipsoids.centers) if motion is None else motion.integrals()
+    threshold = max(similarity_threshold(integrals), _STILL * spacing)
     if frames == 1:
         grouping = Grouping.without_motion(integrals, threshold)
     elif settings.iterative:
@@ -83,13 +99,19 @@ def segment_m3(
     # One ellipsoid for each body and frame (section 7, end), and its turns
     body, count = grouping.body, len(grouping.seeds)
     bodies = unite(paths.ellipsoids, body, count)
+    if motion is None:
+        rotations, positions = body_rotations(paths.ellipsoids, body, bodies), bodies.centers
+    else:
+        rotations, positions = carried_bodies(paths.ellipsoids, body, motion, count)
     contacts, touching = contacts_of_bodies(paths.contacts, paths.touching, body, count)
     return Segmentation(
         paths.ellipsoids,
         body,
         paths.labels,
         bodies,
-        body_rotations(paths.ellipsoids, body, bodies),
+        rotations,
+        positions,
+        motion is not None,
         contacts,
         touching,
         grouping.seeds,
@@ -107,6 +129,7 @@ def ellipsoid_paths(
     settings: SegmentationSettings,
     executor: Executor | None = None,
     progress: Progress = silent,
+    tracks: np.ndarray | None = None,
 ) -> EllipsoidPaths:
     """Split every frame into ellipsoids, merge those of the first, and match them in time (sections 5 and 6).
 
@@ -116,7 +139,7 @@ def ellipsoid_paths(
     # Split every frame (section 5.2.1)
     splits = map_items(split, range(frames), executor, "segment", progress)
     # Merge those of the first (section 5.2.2), and match them from frame to frame (section 6)
-    return match_frames(splits, settings)
+    return match_frames(splits, settings, tracks)
 
 
 def _checked(points: Points | Sequence[np.ndarray], frames: int | None, spacing: float) -> tuple[Points, int]:

@@ -28,6 +28,10 @@ class Segmentation:
         (T, B, …): one for all points of each body; errors are NaN.
     body_rotations : (T, B, 3, 3) float
         Rotation since frame 0, world axes.
+    body_positions : (T, B, 3) float, metres, world
+        Centres of the bodies; where tracked points lead them if `carried`.
+    carried : bool
+        Whether tracked points carried the ellipsoids: turns are known then.
     contacts : (B, B) float
         Neighbouring pairs of points between two bodies, mean over the frames looked at.
     touching : (B, B) float
@@ -49,6 +53,8 @@ class Segmentation:
     point_ellipsoids: tuple[np.ndarray, ...]
     bodies: Ellipsoids
     body_rotations: np.ndarray
+    body_positions: np.ndarray
+    carried: bool
     contacts: np.ndarray
     touching: np.ndarray
     seeds: np.ndarray
@@ -61,11 +67,6 @@ class Segmentation:
     def body_count(self) -> int:
         """Number of bodies B."""
         return self.bodies.counts.shape[1]
-
-    @property
-    def body_positions(self) -> np.ndarray:
-        """Centres of the bodies, (T, B, 3), metres, world."""
-        return self.bodies.centers
 
     def body_labels(self, frame: int) -> np.ndarray:
         """Body of every point of a frame, (N,) int32; -1: none."""

@@ -18,7 +18,8 @@ class SegmentationSettings(Settings):
         json_schema_extra={
             "flag": "method",
             "evidence": "adjusted Rand index of all points / of the bodies' cores, synthetic man and horse walking, "
-            "version 0.1: motion 0.92 / 0.99 and 0.67 / 0.81, m3 0.19 / 0.19 and 0.23 / 0.30",
+            "version 0.1: motion 0.92 / 0.99 and 0.67 / 0.81, m3 0.21 / 0.34 and 0.11 / 0.13, carried by patches "
+            "0.73 / 0.88 and 0.44 / 0.55",
         },
     )
     paths: Literal["auto", "patches", "nodes", "both", "points", "ellipsoids"] = Field(
@@ -27,7 +28,7 @@ class SegmentationSettings(Settings):
         "not tracked at all); both: nodes that patches keep from sliding; points: those of scans which are the same in "
         "all frames; ellipsoids: the paper's, split, merged and matched, for comparison; auto: of a capture patches "
         "where they cover the surface, and on the rest of it nodes that they hold; of scans points where neighbours "
-        "stay so, otherwise nodes",
+        "stay so, otherwise nodes; with m3 patches or points carry the paper's ellipsoids, else nothing does",
         json_schema_extra={
             "flag": "paths",
             "evidence": "as above, but without soft borders and refinement: patches 0.81 / 0.97 and 0.64 / 0.75, nodes "
@@ -57,11 +58,6 @@ class SegmentationSettings(Settings):
         default=0.0,
         ge=0,
         description="matching: weight of neighbours that move differently against a distance of centres (no unit)",
-    )
-    body_deviations: float = Field(
-        default=1.0,
-        description="paths closer than this many standard deviations below the mean of the logarithms belong to one "
-        "body; larger: more bodies (no unit)",
     )
     iterative: bool = Field(
         default=False, description="take the largest body out and repeat on each isolated rest, for noisy volumes"

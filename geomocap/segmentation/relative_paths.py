@@ -57,16 +57,16 @@ def path_integrals(paths: np.ndarray) -> np.ndarray:
     return total / len(paths)
 
 
-def similarity_threshold(integrals: np.ndarray, deviations: float) -> float:
-    """T_sb from the set of integrals of all pairs: so many standard deviations below their mean, of the logarithms.
+def similarity_threshold(integrals: np.ndarray) -> float:
+    """T_sb from the set of integrals of all pairs: where their logarithms fall apart into two classes best.
 
-    The paper leaves the "statistical analysis of the set of integrals" open. Integrals are positive and spread over
-    ratios, hence logarithms; pairs within one body are the small minority of all pairs, hence below the mean.
+    The paper leaves the "statistical analysis of the set of integrals" open. Pairs are of two kinds, within one body or
+    not, and integrals are positive and spread over ratios: so the threshold is that of N. Otsu, "A threshold selection
+    method from gray-level histograms" (IEEE Transactions on Systems, Man, and Cybernetics 9, 1979), of the logarithms.
 
     Parameters
     ----------
     integrals : (K, K) float, metres
-    deviations : float
 
     Returns
     -------
@@ -76,8 +76,14 @@ def similarity_threshold(integrals: np.ndarray, deviations: float) -> float:
     pairs = integrals[np.triu_indices(len(integrals), 1)]
     if len(pairs) == 0 or pairs.max() == 0.0:
         return 0.0
-    logs = np.log(np.maximum(pairs, 1e-6 * pairs.max()))
-    return float(np.exp(logs.mean() - deviations * logs.std()))
+    logs = np.sort(np.log(np.maximum(pairs, 1e-6 * pairs.max())))
+    if len(logs) < 2:
+        return 0.0
+    below = np.arange(1, len(logs))
+    sums = np.cumsum(logs)
+    apart = sums[:-1] / below - (sums[-1] - sums[:-1]) / (len(logs) - below)
+    cut = int(np.argmax(below * (len(logs) - below) * apart**2))
+    return float(np.exp(0.5 * (logs[cut] + logs[cut + 1])))
 
 
 def group_paths(integrals: np.ndarray, centers: np.ndarray, counts: np.ndarray, threshold: float) -> Grouping:

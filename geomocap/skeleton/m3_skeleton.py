@@ -7,11 +7,13 @@ from geomocap.segmentation.axis_joints import grow_joints
 from geomocap.segmentation.body_connections import connect_bodies
 from geomocap.segmentation.m3_result import Segmentation
 from geomocap.segmentation.skeleton_settings import SkeletonSettings
-from geomocap.skeleton.bone_motion import fit_motion, forward_kinematics
+from geomocap.skeleton.bone_motion import fit_motion, fit_offsets, forward_kinematics
 
 
 def skeleton_m3(segmentation: Segmentation, fps: float, settings: SkeletonSettings | None = None) -> Skeleton:
     """Find the joints between the bodies, and the motion (section 8).
+
+    Bones are turned towards the joints of each frame, unless tracked points tell how they turn.
 
     Parameters
     ----------
@@ -33,10 +35,13 @@ def skeleton_m3(segmentation: Segmentation, fps: float, settings: SkeletonSettin
     step = settings.sample_step * segmentation.spacing
     found, _ = grow_joints(bodies.centers, bodies.radii, bodies.rotations, hierarchy.joint_bodies, step)
     # Motion
-    root_positions = bodies.centers[:, hierarchy.root]
-    turned, offsets, body_offsets = fit_motion(
-        hierarchy, segmentation.body_rotations, root_positions, found, bodies.centers
-    )
+    positions = segmentation.body_positions
+    root_positions = positions[:, hierarchy.root]
+    observed = (segmentation.body_rotations, root_positions, found, positions)
+    if segmentation.carried:
+        turned, (offsets, body_offsets) = segmentation.body_rotations, fit_offsets(hierarchy, *observed)
+    else:
+        turned, offsets, body_offsets = fit_motion(hierarchy, *observed)
     fixed = forward_kinematics(hierarchy, offsets, hierarchy.local_rotations(turned), root_positions)[0]
     names = body_names(bodies.counts.shape[1])
     return Skeleton(
@@ -45,7 +50,7 @@ def skeleton_m3(segmentation: Segmentation, fps: float, settings: SkeletonSettin
         joint_names(hierarchy.joint_bodies, names),
         names,
         turned,
-        bodies.centers,
+        positions,
         hierarchy.root,
         offsets,
         body_offsets,

@@ -112,7 +112,7 @@ def benchmark() -> list[Row]:
         paths = match_frames(sequence, settings)
         integrals = path_integrals(paths.ellipsoids.centers)
         first = paths.ellipsoids
-        threshold = similarity_threshold(integrals, settings.body_deviations)
+        threshold = similarity_threshold(integrals)
         grouping = group_paths(integrals, first.centers[0], first.counts[0], threshold)
         bodies = unite(paths.ellipsoids, grouping.body, len(grouping.seeds))
         body_rotations(paths.ellipsoids, grouping.body, bodies)

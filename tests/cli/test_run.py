@@ -125,6 +125,26 @@ def test_scans_are_segmented_like_voxels(finished, small_capture, geomocap, tmp_
     np.testing.assert_array_equal(ours["body"], other["body"])
 
 
+def test_patches_carry_the_ellipsoids_of_m3(finished, small_capture, geomocap, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    m3 = ["--method", "m3", "--no-pictures"]
+    geomocap("run", small_capture, run, *QUICK, *m3, "--paths", "patches")
+    carried = np.load(run / "skeleton.npz")["body_rotations"]
+    geomocap("run", small_capture, run, *QUICK, *m3)
+    alone = np.load(run / "skeleton.npz")["body_rotations"]
+    assert (run / "tracks.npz").exists()
+    assert carried.shape != alone.shape or not np.allclose(carried, alone)
+
+
+def test_m3_names_what_is_missing_to_carry_it(finished, geomocap, tmp_path):
+    m3 = ["--method", "m3", "--fps", 10, "--no-pictures"]
+    result = geomocap("segment", finished / "voxels", tmp_path / "run", *m3, "--paths", "patches", check=False)
+    assert "no surface patches could be followed in the images; set segmentation.paths = auto" in result.stderr
+    result = geomocap("segment", finished / "voxels", tmp_path / "run", *m3, "--paths", "points", check=False)
+    assert result.returncode == 2 and "points" in result.stderr
+
+
 def test_scans_without_colours_or_cameras_get_bodies_by_motion(finished, geomocap, tmp_path):
     geomocap("segment", finished / "voxels", tmp_path / "run", "--fps", 10, "--no-pictures")
     skeleton = np.load(tmp_path / "run/skeleton.npz")

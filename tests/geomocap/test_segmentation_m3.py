@@ -174,10 +174,30 @@ def test_threshold_follows_the_scale_of_the_motion():
     rng = np.random.default_rng(0)
     integrals = np.exp(rng.normal(size=(30, 30)))
     integrals = integrals + integrals.T
-    once, twice = similarity_threshold(integrals, 1.0), similarity_threshold(2 * integrals, 1.0)
-    assert twice == pytest.approx(2 * once)
-    assert similarity_threshold(integrals, 0.0) > once
-    assert similarity_threshold(np.zeros((1, 1)), 1.0) == 0.0
+    assert similarity_threshold(2 * integrals) == pytest.approx(2 * similarity_threshold(integrals))
+    assert similarity_threshold(np.zeros((1, 1))) == similarity_threshold(np.ones((2, 2))) == 0.0
+
+
+def test_threshold_lies_between_pairs_of_one_body_and_others():
+    body = np.repeat([0, 1, 2], [6, 3, 2])
+    rng = np.random.default_rng(1)
+    integrals = np.where(body[:, None] == body, 0.01, 0.2) * np.exp(0.3 * rng.normal(size=(11, 11)))
+    integrals = np.minimum(integrals, integrals.T)
+    within = integrals[(body[:, None] == body) & ~np.eye(11, dtype=bool)]
+    assert within.max() < similarity_threshold(integrals) < integrals[body[:, None] != body].min()
+
+
+def test_threshold_is_the_best_of_all_cuts():
+    pairs = np.random.default_rng(2).lognormal(size=45)
+    integrals = np.zeros((10, 10))
+    integrals[np.triu_indices(10, 1)] = pairs
+    logs = np.sort(np.log(pairs))
+
+    def between(cut: int) -> float:
+        return cut * (45 - cut) * (logs[:cut].mean() - logs[cut:].mean()) ** 2
+
+    best = max(range(1, 45), key=between)
+    assert similarity_threshold(integrals) == pytest.approx(np.exp(logs[best - 1 : best + 1].mean()))
 
 
 def test_union_of_one_ellipsoid_is_itself(segmentation):
