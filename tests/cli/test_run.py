@@ -142,7 +142,7 @@ def test_m3_names_what_is_missing_to_carry_it(finished, geomocap, tmp_path):
     result = geomocap("segment", finished / "voxels", tmp_path / "run", *m3, "--paths", "patches", check=False)
     assert "no surface patches could be followed in the images; set segmentation.paths = auto" in result.stderr
     result = geomocap("segment", finished / "voxels", tmp_path / "run", *m3, "--paths", "points", check=False)
-    assert result.returncode == 2 and "points" in result.stderr
+    assert result.returncode and "segmentation.paths" in result.stderr
 
 
 def test_scans_without_colours_or_cameras_get_bodies_by_motion(finished, geomocap, tmp_path):
