@@ -1,4 +1,4 @@
-"""Which bodies are connected: a tree from their contacts and the order in which they were found."""
+"""Which bodies are connected: a tree of those that touch most."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from geomocap.model.hierarchy import Hierarchy
 def connect_bodies(contacts: np.ndarray, touching: np.ndarray, centers: np.ndarray, min_touching: float) -> Hierarchy:
     """Connect bodies into a tree (section 8; the paper leaves open how).
 
-    Bodies are numbered in the order in which they were found, which walks along limbs. A body found later is connected
-    to one found before it: that with the most contact, among those it touches often enough. The first body, found at
-    the centre of gravity, is the root. Connections only go back in the order, so there are no cycles. A body that
-    touches no earlier one often enough is connected to the one that it touches most often, or else to the nearest.
+    It grows from the first body, found at the centre of gravity, each time by that pair of a body in it and one outside
+    that has the most contact, of pairs that touch often enough (Prim's maximal spanning tree). Where none does, that
+    which touches most often is taken, or else the nearest.
 
     Parameters
     ----------
@@ -34,15 +33,15 @@ def connect_bodies(contacts: np.ndarray, touching: np.ndarray, centers: np.ndarr
     count = len(contacts)
     if count == 0:
         raise GeometryError("no rigid bodies to connect: at least two frames with motion are needed")
-    parents = np.full(count, -1)
-    for body in range(1, count):
-        earlier = np.arange(body)
-        often = touching[body, earlier] >= max(min_touching, 1e-9)
-        if often.any():
-            parents[body] = np.argmax(np.where(often, contacts[body, earlier], -1.0))
-        elif touching[body, earlier].any():
-            parents[body] = np.argmax(touching[body, earlier])
-        else:
-            parents[body] = np.argmin(np.linalg.norm(centers[:, earlier] - centers[:, [body]], axis=-1).mean(axis=0))
-    pairs = [(parents[body], body) for body in range(1, count)]
+    often = touching >= max(min_touching, 1e-9)
+    near = np.linalg.norm(centers[:, :, None] - centers[:, None], axis=-1).mean(axis=0)
+    inside = np.arange(count) == 0
+    pairs = []
+    while not inside.all():
+        within = np.flatnonzero(inside)[:, None], np.flatnonzero(~inside)
+        wishes = (np.where(often, contacts, 0.0)[within], touching[within], 1.0 / (1.0 + near[within]))
+        wish = next(w for w in wishes if w.any())
+        parent, body = np.unravel_index(np.argmax(wish), wish.shape)
+        pairs.append((within[0][parent, 0], within[1][body]))
+        inside[pairs[-1][1]] = True
     return Hierarchy(0, np.array(pairs, np.int32).reshape(-1, 2))

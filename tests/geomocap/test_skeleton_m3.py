@@ -88,7 +88,15 @@ def test_joint_of_touching_ends_and_of_apart_bodies():
     assert overlapping.tolist() == [[True, False]]
 
 
-def test_connections_follow_contact_and_order():
+def test_connections_go_on_where_there_is_most_contact():
+    contacts = np.zeros((4, 4))
+    for a, b, amount in [(0, 1, 2), (0, 2, 9), (1, 2, 5), (1, 3, 4), (2, 3, 3)]:
+        contacts[a, b] = contacts[b, a] = amount
+    tree = connect_bodies(contacts, np.ones((4, 4)), np.zeros((1, 4, 3)), 0.5)
+    assert tree.joint_bodies.tolist() == [[0, 2], [2, 1], [1, 3]]
+
+
+def test_connections_follow_contact_that_lasts():
     contacts = np.zeros((5, 5))
     touching = np.zeros((5, 5))
     for a, b, amount, fraction in [(0, 1, 9, 1.0), (1, 2, 5, 0.9), (0, 2, 50, 0.1), (0, 3, 3, 0.2)]:
