@@ -30,7 +30,7 @@ from geomocap.pipeline.sources import Source, geometry_of
 from geomocap.pipeline.track_stage import tracks
 from geomocap.pipeline.window_stage import segment_windows
 from geomocap.scheduling import map_items
-from geomocap.segmentation.m3 import segment_m3
+from geomocap.segmentation.m3 import check_variant, segment_m3
 from geomocap.segmentation.m3_result import Segmentation
 from geomocap.skeleton.m3_skeleton import skeleton_m3
 from geomocap.subject.subject_model import MODEL_FILE
@@ -41,6 +41,7 @@ def segment(job: Job, source: Source) -> str:
     config = job.config
     if job.capture is not None and config.segmentation.paths == "points":
         raise SettingsError("segmentation.paths = points is for scans; of a capture take auto, patches or nodes")
+    check_variant(config.segmentation)
     geometry, source_key = geometry_of(job, source)
     if job.model is not None:
         return segment_with_model(job, geometry, source_key)

@@ -75,10 +75,7 @@ def segment_m3(
     points, frames = _checked(points, frames, spacing)
     if tracks is not None and tracks.shape[1:] != (frames, 3):
         raise GeometryError(f"tracks have shape {tracks.shape}, expected (N, {frames}, 3): one position a frame")
-    if tracks is not None and settings.iterative:
-        raise SettingsError(
-            "segmentation.iterative takes volumes apart and follows no tracks; leave out one of the two"
-        )
+    check_variant(settings, tracks is not None)
 
     def follow(some: Points, some_progress: Progress = silent) -> EllipsoidPaths:
         return ellipsoid_paths(some, frames, spacing, settings, executor, some_progress)
@@ -120,6 +117,22 @@ def segment_m3(
         paths.repaired,
         spacing,
     )
+
+
+def check_variant(settings: SegmentationSettings, carried: bool | None = None) -> None:
+    """Refuse the iterative variant with tracks; whether there are some is what the settings say, if not given.
+
+    Raises
+    ------
+    SettingsError
+    """
+    if carried is None:
+        carried = settings.method == "m3" and settings.paths in ("patches", "points")
+    if carried and settings.iterative:
+        raise SettingsError(
+            "segmentation.iterative takes volumes apart and follows no tracks; set segmentation.paths = auto, or "
+            "segmentation.iterative = false"
+        )
 
 
 def ellipsoid_paths(

@@ -143,6 +143,18 @@ def test_m3_names_what_is_missing_to_carry_it(finished, geomocap, tmp_path):
     assert "no surface patches could be followed in the images; set segmentation.paths = auto" in result.stderr
     result = geomocap("segment", finished / "voxels", tmp_path / "run", *m3, "--paths", "points", check=False)
     assert result.returncode and "segmentation.paths" in result.stderr
+    result = geomocap(
+        "segment",
+        finished / "voxels",
+        tmp_path,
+        *m3,
+        "--paths",
+        "points",
+        "--segmentation.iterative",
+        "true",
+        check=False,
+    )
+    assert "segmentation.iterative takes volumes apart" in result.stderr
 
 
 def test_scans_without_colours_or_cameras_get_bodies_by_motion(finished, geomocap, tmp_path):

@@ -248,8 +248,8 @@ def test_pieces_are_judged_as_by_sets_of_pixels(seed):
 
 
 def test_fine_voxels_are_cleared_by_the_cells_they_are_in():
-    fine = Grid(GRID.origin, GRID.voxel_size / 4, (320, 320, 320))
-    centers = fine.centers(np.stack(np.indices((320, 320, 320)), axis=-1).reshape(-1, 3))
+    fine = Grid(GRID.origin, GRID.voxel_size / 3, (240, 240, 240))
+    centers = fine.centers(np.stack(np.indices((240, 240, 240)), axis=-1).reshape(-1, 3))
     volume = Occupancy.of_dense(np.any([inside(centers, b) for b in [*WALLS, CORNER]], axis=0).reshape(fine.shape))
     found = without_phantoms(shadows(TWO, WALLS), fine, volume)
     walls = Occupancy.of_dense(np.any([inside(centers, b) for b in WALLS], axis=0).reshape(fine.shape))
