@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from geomocap.model.ellipsoids import fit_ellipsoids
 from geomocap.segmentation.axis_joints import grow_joints
-from geomocap.segmentation.body_rotations import body_rotations
+from geomocap.segmentation.body_rotations import body_rotations, carried_bodies
 from geomocap.segmentation.contacts import count_contacts
 from geomocap.segmentation.ellipsoid_matching import match_frames
 from geomocap.segmentation.ellipsoid_merging import merge_frame, merge_leaves
@@ -22,6 +22,7 @@ from tests.benchmarks.table import Row, measure
 
 SPACING = 0.0113
 FRAMES = 220
+_EVERY = 300  # of the surface's points are tracked
 
 
 def _capsule(rng: np.random.Generator, length: float, radius: float) -> np.ndarray:
@@ -33,8 +34,8 @@ def _capsule(rng: np.random.Generator, length: float, radius: float) -> np.ndarr
     return np.stack([along, ring * np.cos(turn), ring * np.sin(turn)], axis=1)
 
 
-def _figure(angle: float) -> np.ndarray:
-    """Surface voxels of a person of capsules whose arms and legs swing, (N, 3)."""
+def _surface(angle: float) -> np.ndarray:
+    """The same points of the surface of a person of capsules whose arms and legs swing, (N, 3)."""
     rng = np.random.default_rng(0)
     down = Rotation.from_rotvec([0, np.pi / 2, 0])
     trunk, head = down.apply(_capsule(rng, 0.42, 0.17)), down.apply(_capsule(rng, 0.08, 0.11))
@@ -46,7 +47,12 @@ def _figure(angle: float) -> np.ndarray:
             parts.append(swing.apply(down.apply(_capsule(rng, upper, radius))) + at)
             joint = swing.apply(down.apply([[upper + radius, 0, 0]]))[0] + at
             parts.append((swing * bend).apply(down.apply(_capsule(rng, upper, radius * 0.8))) + joint)
-    return (np.unique(np.floor(np.concatenate(parts) / SPACING).astype(np.int64), axis=0) + 0.5) * SPACING
+    return np.concatenate(parts)
+
+
+def _figure(angle: float) -> np.ndarray:
+    """Surface voxels of that person, (N, 3)."""
+    return (np.unique(np.floor(_surface(angle) / SPACING).astype(np.int64), axis=0) + 0.5) * SPACING
 
 
 def _split_numpy(points: np.ndarray, depth: int) -> list[np.ndarray]:
@@ -118,6 +124,18 @@ def benchmark() -> list[Row]:
         body_rotations(paths.ellipsoids, grouping.body, bodies)
 
     rows.append(Row(f"match + bodies, {FRAMES} frames", measure(match_and_group, 3), goal="≤ 2 s"))
+    angles = 2 * np.pi * np.arange(FRAMES) / 20
+    tracks = np.stack([_surface(angle)[::_EVERY] for angle in angles], axis=1)
+
+    def carry_and_group() -> None:
+        paths = match_frames(sequence, settings, tracks)
+        assert paths.motion is not None
+        integrals = paths.motion.integrals()
+        first = paths.ellipsoids
+        grouping = group_paths(integrals, first.centers[0], first.counts[0], similarity_threshold(integrals))
+        carried_bodies(first, grouping.body, paths.motion, len(grouping.seeds))
+
+    rows.append(Row(f"the same, carried by {len(tracks)} tracked points", measure(carry_and_group, 1)))
     result = segment_m3([period[k % 20] for k in range(60)], spacing=SPACING, settings=settings)
     skeleton = skeleton_m3(result, 15)
     bodies, pairs = result.bodies, skeleton.joint_bodies
