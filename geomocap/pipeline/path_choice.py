@@ -105,19 +105,23 @@ def carrying_tracks(job: Job, geometry: Geometry, has_tracks: bool) -> np.ndarra
     wanted = job.config.segmentation.paths
     if wanted != "patches":
         return _point_tracks(job, geometry) if wanted == "points" else None
-    tracks = _tracks_of_several(read_trajectories(job.run)) if has_tracks else None
-    if tracks is None:
+    tracked = read_trajectories(job.run) if has_tracks else None
+    if tracked is None or not (lasting := _lasting(tracked)).any():
         raise GeometryError(
             f"{job.run.path}: no surface patches could be followed in the images; set segmentation.paths = auto"
         )
-    return tracks
+    return tracked.positions[lasting].astype(float)
 
 
 def _tracks_of_several(tracked: Trajectories) -> np.ndarray | None:
     """Positions of trajectories that no single camera placed, (N, T, 3), metres; None: there are none."""
-    lasting = tracked.lengths >= max(2, SHORT_FRACTION * tracked.n_frames)
-    chosen = np.flatnonzero(lasting & ~tracked.ray.any(axis=(1, 2)))
+    chosen = np.flatnonzero(_lasting(tracked) & ~tracked.ray.any(axis=(1, 2)))
     return tracked.positions[chosen].astype(float) if len(chosen) else None
+
+
+def _lasting(tracked: Trajectories) -> np.ndarray:
+    """Which trajectories are measured in enough frames to say something of bodies, (N,) bool."""
+    return np.asarray(tracked.lengths >= max(2, SHORT_FRACTION * tracked.n_frames))
 
 
 def _follow_nodes(job: Job, geometry: Geometry, anchors: MotionPaths | None) -> MotionPaths:

@@ -16,7 +16,7 @@ from geomocap.model.trajectories import Trajectories
 from geomocap.motion import SAMPLES
 from geomocap.nodes.node_settings import NodeTrackingSettings
 from geomocap.pipeline.job import Job
-from geomocap.pipeline.path_choice import ALONE_FRACTION, motion_paths, patch_paths, path_spacing
+from geomocap.pipeline.path_choice import ALONE_FRACTION, carrying_tracks, motion_paths, patch_paths, path_spacing
 from geomocap.segmentation.m3_settings import SegmentationSettings
 
 FRAMES = 3
@@ -184,3 +184,14 @@ def test_tracks_that_paths_were_chosen_from_come_along(job):
     tracks[1, 1:] = np.nan
     found = motion_paths(job("auto", tracks, ray), Ball(), True)[1]
     np.testing.assert_allclose(found, tracks[3::2])
+
+
+def test_what_carries_ellipsoids_is_all_that_lasts_where_it_is_asked_for(job):
+    tracks = trajectories(50, 1.0)
+    tracks[0, 1:] = np.nan
+    ray = np.zeros_like(tracks)
+    ray[::2, :, 1] = 1.0  # single cameras carry, too
+    np.testing.assert_allclose(carrying_tracks(job("patches", tracks, ray), Ball(), True), tracks[1:])
+    assert carrying_tracks(job("auto", tracks), Ball(), False) is None
+    with pytest.raises(GeometryError, match=r"no surface patches could be followed.*segmentation\.paths = auto"):
+        carrying_tracks(job("patches", tracks), Ball(), False)
