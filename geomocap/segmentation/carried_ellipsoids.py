@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 from geomocap.model.rotations import rigid_motion
 from geomocap.segmentation.ellipsoid_splitting import SplitFrame
 
-_FEWEST = 4  # points by which a motion is known and checked
-_ASTRAY = 2.5  # times the median miss, beyond which a point went astray
+_FEWEST = 4  # points by which a motion is known, and one more that checks it
+_ASTRAY = 2.5  # times the median miss, beyond which a point went astray; no other value was tried
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class Carrier:
         return EllipsoidMotion(rotations, translations, self._centers)
 
     def _seen(self, frame: int) -> np.ndarray:
-        return np.asarray(np.isfinite(self.tracks[:, frame, 0]))
+        return np.asarray(np.isfinite(self.tracks[:, frame]).all(axis=1))
 
     def _moved(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Motions since frame 0; an ellipsoid with too few points moves on as the nearest one that has enough."""

@@ -20,7 +20,10 @@ from geomocap.segmentation.ellipsoid_splitting import SplitFrame, split_points
 from geomocap.segmentation.m3_settings import SegmentationSettings
 
 _CONTACTS_EVERY = 4
-_ELSEWHERE = 1e6  # what it costs, spacings, to go where none of an ellipsoid's tracked points does
+# What it costs, spacings, to go where none of an ellipsoid's tracked points does: more than any other way. Core index
+# of a man, a mechanism and two horses, from where points carry ellipsoids alone → and from what they say of leaves:
+# 0.85, 0.67, 0.39, 0.66 → 0.87, 0.71, 0.55, 0.54.
+_ELSEWHERE = 1e6
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,7 @@ def test_a_limb_that_turns_is_one_body(arm, carried):
     points, _, angles = arm
     assert carried.body_count == 2
     for frame in (0, 6, 18):
+        # a quarter of the points are seen of each half; the piece of volume at the hinge belongs to one of the two
         assert (parts(points, carried, frame).max(axis=1) / len(points[0]) > 0.22).all()
     rests, swings = parts(points, carried, 6).argmax(axis=1)
     turned = turn_angles(carried.body_rotations)
@@ -70,7 +71,8 @@ def test_without_tracks_a_limb_that_turns_falls_into_several(arm):
 def test_the_joint_is_at_the_hinge(carried):
     skeleton = skeleton_m3(carried, 25.0)
     assert skeleton.joint_count == 1
-    assert np.linalg.norm(skeleton.joint_positions, axis=2).max() < 0.04
+    # shapes tell where it is, not motions: within the radius of the limbs (0.033 measured)
+    assert np.linalg.norm(skeleton.joint_positions, axis=2).max() < 0.05
 
 
 def test_points_that_come_go_and_go_astray_change_little(arm, carried):
@@ -84,8 +86,9 @@ def test_points_that_come_go_and_go_astray_change_little(arm, carried):
     tracks[astray] += np.linspace(0, 0.1, tracks.shape[1])[:, None]
     found = segment_m3(sampled_afresh(points), spacing=SPACING, settings=SETTINGS, tracks=tracks)
     swings = parts(points, found, 6)[1].argmax()
-    assert found.body_count <= 4
-    np.testing.assert_allclose(turn_angles(found.body_rotations)[:, swings], np.abs(angles), atol=0.1)
+    assert found.body_count == 2
+    # a tenth of the points that are 0.1 m off at the end would turn it by some hundredths; 0.0016 measured
+    np.testing.assert_allclose(turn_angles(found.body_rotations)[:, swings], np.abs(angles), atol=0.005)
 
 
 def test_ellipsoids_without_points_go_along_with_the_nearest(arm):
@@ -112,13 +115,17 @@ def test_integrals_are_those_of_paths_seen_from_each_other():
     np.testing.assert_allclose(motion.centers[:, 0], turns.apply(rest[0]) + shifts)
     found = motion.integrals()
     assert found[0, 1] < 1e-12  # one body, however it turns
-    away = [
-        np.linalg.norm(p - p.mean(axis=0), axis=1).mean()
-        for p in (turns.apply(rest[0]) + shifts, None)
-        if p is not None
-    ]
-    assert found[0, 2] == found[2, 0] <= away[0] + 1e-12
+    moved = turns.apply(rest[0]) + shifts
+    views = [moved - rest[2], turns.inv().apply(rest[2] - moved)]  # of the first by the last, and the reverse
+    steadier = min(np.linalg.norm(v - v.mean(axis=0), axis=1).mean() for v in views)
+    np.testing.assert_allclose([found[0, 2], found[2, 0]], steadier)
     np.testing.assert_allclose(np.diag(found), 0.0)
+
+
+def test_a_single_frame_has_ellipsoids_and_no_bodies(arm):
+    points, _, _ = arm
+    found = segment_m3(points[:1], spacing=SPACING, settings=SETTINGS, tracks=tracks_of(points)[:, :1])
+    assert found.body_count == 0 and found.body_rotations.shape == (1, 0, 3, 3) and (found.body == -1).all()
 
 
 def test_tracks_that_do_not_fit_are_refused(arm):
