@@ -276,7 +276,8 @@ def _ellipsoids(results: Results, stage: ViewStage | None, frames: list[int], de
     paths = relative_paths(e, results.diagnostics)
     words = (
         "A relative path is a path minus its mean. Ellipsoids of one body move alike: their curves lie together, and "
-        "their distance curves to each other stay low."
+        "their distance curves to each other stay low. By them the paper's method tells bodies apart; where points "
+        "were tracked, these do it by paths of their own, which don't slide as ellipsoids do."
     )
     curves = figures.path_curves(paths, e.bodies, results.up, results.fps)
     blocks += desk.plot("path_curves", curves, "Relative paths and distance curves", words)
