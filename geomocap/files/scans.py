@@ -63,6 +63,7 @@ class Scans:
     tracked: bool = False
 
     features = None
+    normals = None
 
     def __len__(self) -> int:
         return len(self.names)

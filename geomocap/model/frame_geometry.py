@@ -28,6 +28,11 @@ class Geometry(Protocol):
         """`features(frame) -> (N, F)`: what else is known of the points, such as colours from 0 to 1; None: nothing."""
         ...
 
+    @property
+    def normals(self) -> Callable[[int], np.ndarray] | None:
+        """`normals(frame) -> (N, 3)`: outward unit normals of the points, 0 where unknown; None: there are none."""
+        ...
+
     def __len__(self) -> int: ...
 
     def points(self, frame: int) -> np.ndarray:
@@ -51,6 +56,12 @@ class GeometryPart:
     def features(self) -> Callable[[int], np.ndarray] | None:
         """What else is known of the points, see `Geometry`."""
         known = self.whole.features
+        return None if known is None else lambda frame: known(self.part[frame])
+
+    @property
+    def normals(self) -> Callable[[int], np.ndarray] | None:
+        """Outward unit normals of the points, see `Geometry`."""
+        known = self.whole.normals
         return None if known is None else lambda frame: known(self.part[frame])
 
     def __len__(self) -> int:

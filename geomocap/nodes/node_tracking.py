@@ -226,6 +226,7 @@ def track_nodes(
     executor: Executor | None = None,
     anchors: MotionPaths | None = None,
     images: Callable[[int], Views] | None = None,
+    normals: Points | None = None,
 ) -> NodeTracks:
     """Follow nodes of a surface through all frames, forwards and backwards from the most open one.
 
@@ -244,6 +245,8 @@ def track_nodes(
         P points of the surface whose paths are known from elsewhere: nodes near them do not slide.
     images : callable, optional
         `images(frame)`, what the cameras see: nodes move as it does.
+    normals : callable, optional
+        `normals(frame) -> (M, 3) float`, outward unit normals of the points, 0 where unknown; from planes if not given.
 
     Raises
     ------
@@ -255,7 +258,7 @@ def track_nodes(
         raise GeometryError("nodes can't be tracked through a sequence without frames")
     if executor is None:
         with threads() as own:
-            return track_nodes(points, n_frames, settings, features, progress, own, anchors, images)
+            return track_nodes(points, n_frames, settings, features, progress, own, anchors, images, normals)
     unit = Unit.of(np.asarray(points(0), float))
 
     def prepare(frame: int) -> PointSet:
@@ -264,7 +267,8 @@ def track_nodes(
         # dense points are averaged over as much of the surface as few points are
         neighbours = max(settings.neighbours, min(len(found), 3 * settings.points) * 5 // (2 * settings.nodes))
         try:
-            return point_set(found, settings.points, neighbours, settings.seed + frame, more)
+            outward = None if normals is None else normals(frame)
+            return point_set(found, settings.points, neighbours, settings.seed + frame, more, outward)
         except GeometryError as error:
             raise GeometryError(f"frame {frame}: {error}; check this frame's geometry") from None
 

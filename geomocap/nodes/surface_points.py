@@ -86,7 +86,12 @@ class PointSet:
 
 
 def point_set(
-    points: np.ndarray, n_points: int, neighbours: int, seed: int = 0, features: np.ndarray | None = None
+    points: np.ndarray,
+    n_points: int,
+    neighbours: int,
+    seed: int = 0,
+    features: np.ndarray | None = None,
+    normals: np.ndarray | None = None,
 ) -> PointSet:
     """Make a point set of at most `n_points`, normals and gradients measured on all points; coincident ones are one.
 
@@ -99,6 +104,9 @@ def point_set(
         Neighbours that make a normal.
     seed : int
     features : (M, F) float, optional
+    normals : (M, 3) float, optional
+        Outward unit normals, where they are known better than from the points' planes, which leave the side open; 0
+        where they are not.
 
     Raises
     ------
@@ -118,9 +126,14 @@ def point_set(
         )
     points, features = points[chosen], features[chosen]
     near = cKDTree(points).query(points, neighbours + 1)[1]
-    normals = oriented_normals(points, near)
-    gradients = feature_gradients(points, normals, near, features)
-    return PointSet(points, normals, np.asarray(features, float), gradients).thinned(n_points, seed)
+    if normals is None:
+        outward = oriented_normals(points, near)
+    else:
+        outward = np.array(normals, float)[chosen]
+        unknown = ~outward.any(axis=1)
+        outward[unknown] = plane_normals(points, near[unknown])
+    gradients = feature_gradients(points, outward, near, features)
+    return PointSet(points, outward, np.asarray(features, float), gradients).thinned(n_points, seed)
 
 
 def oriented_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:

@@ -134,7 +134,15 @@ def _follow_nodes(job: Job, geometry: Geometry, anchors: MotionPaths | None) -> 
     if job.capture is not None and anchors is not None:
         images = frame_reader(as_seen(job.run, job.capture), job.run, job.config.tracking, job.config.cloud)
     nodes = track_nodes(
-        geometry.points, len(geometry), following, features, job.progress, job.executor, anchors, images
+        geometry.points,
+        len(geometry),
+        following,
+        features,
+        job.progress,
+        job.executor,
+        anchors,
+        images,
+        geometry.normals,
     )
     return nodes.motion_paths(anchors)  # images hold nodes, which the geometry doesn't know
 

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from geomocap.carving.visibility import enclosing_normals
 from geomocap.errors import GeometryError
 from geomocap.files.frame_files import read_points, read_voxels
 from geomocap.files.run import Run, stage_key
@@ -43,6 +44,10 @@ class VoxelFrames:
         """Colours of the voxels, (N, 3) float, 0 to 1."""
         return read_voxels(self.run.frame_file("voxels", frame)).colors / 255.0
 
+    def normals(self, frame: int) -> np.ndarray:
+        """Outward unit normals of the voxels, (N, 3) float, by what they enclose."""
+        return enclosing_normals(read_voxels(self.run.frame_file("voxels", frame)).indices)
+
 
 @dataclass(frozen=True)
 class CloudFrames:
@@ -50,6 +55,7 @@ class CloudFrames:
 
     run: Run
     frames: int
+    normals = None
 
     @property
     def spacing(self) -> float:

@@ -13,7 +13,14 @@ from geomocap.carving.frames import carve_frame, needs_images
 from geomocap.carving.hull import hull
 from geomocap.carving.occupancy import Occupancy
 from geomocap.carving.silhouette_views import PinholeViews
-from geomocap.carving.visibility import SurfaceVoxels, VoxelVisibility, depth_buffers, normals, observations
+from geomocap.carving.visibility import (
+    SurfaceVoxels,
+    VoxelVisibility,
+    depth_buffers,
+    enclosing_normals,
+    normals,
+    observations,
+)
 from geomocap.carving.voxel_grid import Grid
 from tests.geomocap.carving_scenes import look_at, ring
 
@@ -219,6 +226,24 @@ def test_normals_are_the_sum_over_the_neighbourhood():
         expected[n] = -(np.argwhere(padded[i : i + 5, j : j + 5, k : k + 5]) - 2).sum(axis=0)
     expected /= np.maximum(np.linalg.norm(expected, axis=1, keepdims=True), 1e-6)
     np.testing.assert_allclose(normals(occupancy, surface), expected, atol=1e-6)
+
+
+def test_normals_are_known_from_the_surface_alone():
+    x, y, z = np.mgrid[0:40, 0:40, 0:70]
+    wings = (np.abs(z - 30 - np.abs(x - 20) // 2) < 2) & (y > 3) & (y < 37)  # three voxels thick
+    body = (x - 20) ** 2 + (y - 20) ** 2 + (z - 28) ** 2 < 9**2
+    occupancy = Occupancy.of_dense(wings | body)
+    surface = occupancy.surface_indices()
+    shifted = surface + np.array([5, -3, 7], np.int32)  # whatever the grid's corner
+    np.testing.assert_allclose(enclosing_normals(shifted), normals(occupancy, surface), atol=1e-6)
+
+
+def test_normals_are_open_where_nothing_is_enclosed():
+    i, j = np.mgrid[0:9, 0:9]
+    sheet = np.column_stack([i.ravel(), j.ravel(), np.full(81, 4)])
+    inner = ((sheet[:, :2] > 1) & (sheet[:, :2] < 7)).all(axis=1)
+    assert not enclosing_normals(sheet)[inner].any()
+    assert enclosing_normals(sheet[:0]).shape == (0, 3)
 
 
 def test_deviation_is_the_spread_about_the_median():

@@ -29,6 +29,20 @@ def test_normals_point_outwards():
     assert ((outwards * s.normals).sum(axis=1) > 0).mean() > 0.995
 
 
+def test_given_normals_are_taken_where_they_are_known():
+    p = capsule(1500)
+    right = point_set(p, 1000, 9)
+    given = np.random.default_rng(1).normal(size=p.shape)
+    given /= np.linalg.norm(given, axis=1, keepdims=True)
+    given[::2] = 0
+    s = point_set(p, 1000, 9, normals=given)
+    own = given[cKDTree(p).query(s.positions)[1]]
+    known = own.any(axis=1)
+    np.testing.assert_array_equal(s.normals[known], own[known])
+    across = np.abs((s.normals * right.normals).sum(axis=1))[~known]
+    np.testing.assert_allclose(across, 1, atol=1e-9)
+
+
 def test_feature_gradients_of_a_linear_field():
     p = capsule(2000)
     field = np.column_stack([2 * p[:, 0], p @ [1.0, -1, 0.5]])

@@ -27,6 +27,7 @@ class Ball:
     """Points on a ball that moves along x, with a colour."""
 
     spacing = 0.05
+    normals = None
 
     def __len__(self) -> int:
         return FRAMES
