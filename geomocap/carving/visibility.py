@@ -140,10 +140,11 @@ def enclosing_normals(surface: np.ndarray) -> np.ndarray:
     """
     if not len(surface):
         return np.zeros((0, 3))
-    low, high = surface.min(axis=0), surface.max(axis=0)
-    shell = np.zeros(high - low + 1, bool)
-    shell[tuple((surface - low).T)] = True
-    return normals(Occupancy.of_dense(ndimage.binary_fill_holes(shell)), surface - low).astype(float)
+    places = surface - surface.min(axis=0) + 1  # with room around
+    free = np.ones(places.max(axis=0) + 2, bool)
+    free[tuple(places.T)] = False
+    part, _ = ndimage.label(free)
+    return normals(Occupancy.of_dense(part != part[0, 0, 0]), places).astype(float)
 
 
 def camera_centers(P: np.ndarray) -> np.ndarray:
