@@ -7,6 +7,7 @@ import numpy as np
 from geomocap.errors import GeometryError
 from geomocap.evaluation.result_check import SeenOutlines, checked_mesh, model_overlap
 from geomocap.model.frame_geometry import Geometry
+from geomocap.model.skeleton import body_names
 from geomocap.motion import Motion
 from geomocap.outline_refinement import fit_to_outlines
 from geomocap.pipeline.job import Job
@@ -19,6 +20,7 @@ from geomocap.subject.window_motion import motion_of
 # fourteen sets of paths, of thirteen captures, the better was taken with any power from 0.15 to 0.48 in twelve, with
 # 0.5 in eleven, with 0 in nine; in one of the others neither was better. All had been looked at before it was set.
 _PATHS = 0.3
+_LONG_UNSEEN = 0.1  # of the frames
 
 
 def make_model(job: Job, geometry: Geometry, motion: Motion) -> SubjectModel | str:
@@ -70,12 +72,15 @@ def fitted_to_outlines(
     return motion, model
 
 
-def unseen_frames(motion: Motion) -> list[str]:
-    """Say in how many frames no path shows some body."""
-    hidden = (motion.bodies.reliability == 0).any(axis=1)
-    if not hidden.any():
+def unseen_bodies(motion: Motion) -> list[str]:
+    """Say which bodies no path shows for long."""
+    hidden = (motion.bodies.reliability == 0).sum(axis=0)
+    frames = len(motion.bodies.reliability)
+    names = body_names(len(hidden))
+    long = [f"{names[k]} in {hidden[k]}" for k in np.flatnonzero(hidden > _LONG_UNSEEN * frames)]
+    if not long:
         return []
     return [
-        f"In {hidden.sum()} of {len(hidden)} frames no path shows some body; there its neighbours and its own motion "
-        "tell where it is, and silhouettes, if any."
+        f"No path shows {', '.join(long)} of {frames} frames: there neighbours and motion before and after tell where "
+        "it is, and silhouettes, if any; its turns are guesses."
     ]

@@ -20,7 +20,7 @@ from geomocap.pipeline.motion_models import (
     make_model,
     misfit,
     silhouette_overlap,
-    unseen_frames,
+    unseen_bodies,
 )
 from geomocap.pipeline.outline_reading import outlines_of
 from geomocap.pipeline.path_choice import motion_paths
@@ -78,7 +78,7 @@ def segment_by_motion(job: Job, geometry: Geometry, has_tracks: bool, has_silhou
     if has_silhouettes and not isinstance(model, str):
         motion, model = fitted_to_outlines(job, motion, model, tracks)
     bodies, found = motion.bodies, motion.connected
-    warnings = [*camera_warnings(job.run), *motion.warnings, *unseen_frames(motion)]
+    warnings = [*camera_warnings(job.run), *motion.warnings, *unseen_bodies(motion)]
     label = _Label(geometry, job.run, motion.voters)
     ellipsoids = list(map_items(label, range(frames), job.executor, "labels", job.progress))
     job.run.note("segmentation", [job.run.frame_file("bodies", k) for k in range(frames)])

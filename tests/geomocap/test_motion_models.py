@@ -51,9 +51,12 @@ def test_scans_have_no_outlines(tmp_path):
     assert motion_models.fitted_to_outlines(job, motion, model, None) == (motion, model)
 
 
-def test_frames_in_which_no_path_shows_a_body_are_told():
-    reliability = np.ones((5, 3))
+def test_bodies_that_no_path_shows_for_long_are_named():
+    reliability = np.ones((20, 3))
     motion = SimpleNamespace(bodies=SimpleNamespace(reliability=reliability))
-    assert motion_models.unseen_frames(motion) == []
-    reliability[1:3, 2] = 0
-    assert motion_models.unseen_frames(motion)[0].startswith("In 2 of 5 frames no path shows some body")
+    reliability[3:5, 0] = 0  # a tenth of the frames
+    assert motion_models.unseen_bodies(motion) == []
+    reliability[1:8, 1:] = 0
+    reliability[8, 2] = 0
+    said = motion_models.unseen_bodies(motion)
+    assert len(said) == 1 and said[0].startswith("No path shows body01 in 7, body02 in 8 of 20 frames:")

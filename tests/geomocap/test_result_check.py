@@ -86,13 +86,13 @@ def test_a_camera_that_sees_nothing_has_no_say(rig):
     assert np.isfinite(np.delete(found.left_out, 4, axis=0)).all()
 
 
-def made_check(model=0.95, left_out=0.9, camera_low=None):
+def made_check(model=0.95, left_out=0.9, camera_low=None, residual=0.002):
     cameras = ("a", "b", "c", "d")
     outlines, hulls = np.full((4, 3), model), np.full((4, 3), left_out)
     if camera_low is not None:
         hulls[camera_low] = 0.4
     outlines[1, 2] = np.nan
-    return SelfCheck(cameras, np.array([0, 5, 9]), outlines, hulls, 0.002)
+    return SelfCheck(cameras, np.array([0, 5, 9]), outlines, hulls, residual)
 
 
 def test_verdict_in_plain_words():
@@ -100,6 +100,9 @@ def test_verdict_in_plain_words():
     word, reasons = made_check(model=0.7).verdict()
     assert word == "check it" and "70%" in reasons[0]
     assert made_check(model=0.5).verdict()[0] == "don't use it"
+    word, reasons = made_check(residual=0.014).verdict()
+    assert word == "check it" and "1.4% of the subject's diagonal" in reasons[0]
+    assert made_check(residual=float("nan")).verdict()[0] == "trust it"
     assert made_check().verdict(("turns are unsure",)) == ("check it", ("turns are unsure",))
 
 
