@@ -55,7 +55,6 @@ class CloudFrames:
 
     run: Run
     frames: int
-    normals = None
 
     @property
     def spacing(self) -> float:
@@ -71,14 +70,18 @@ class CloudFrames:
 
     def features(self, frame: int) -> np.ndarray:
         """Colours of the points, (N, 3) float, 0 to 1."""
-        return _colors(self.run.frame_file("cloud", frame)) / 255.0
+        return _known(self.run.frame_file("cloud", frame), "colors", "colours") / 255.0
+
+    def normals(self, frame: int) -> np.ndarray:
+        """Unit normals of the points, (N, 3) float, on the side of the cameras that saw them."""
+        return _known(self.run.frame_file("cloud", frame), "normals", "normals")
 
 
-def _colors(path: Path) -> np.ndarray:
-    colors = read_points(path).colors
-    if colors is None:
-        raise GeometryError(f"{path}: its points have no colours; delete it and run again")
-    return colors
+def _known(path: Path, what: Literal["colors", "normals"], called: str) -> np.ndarray:
+    found: np.ndarray | None = getattr(read_points(path), what)
+    if found is None:
+        raise GeometryError(f"{path}: its points have no {called}; delete it and run again")
+    return found
 
 
 def geometry_of(job: Job, source: Source) -> tuple[Geometry, str]:

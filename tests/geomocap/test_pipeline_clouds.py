@@ -55,6 +55,10 @@ def test_one_frame_with_and_without_silhouettes(tmp_path: Path, masks: bool) -> 
     points, colors = frames.points(0), frames.features(0)
     assert len(points) > 1000 and colors.shape == points.shape and 0 < colors.mean() < 1
     assert np.mean(off_surface(points) < 5 * 2.0 / 2500) > 0.98
+    normals = frames.normals(0)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    towards = capture.rig.centers[:, None] - points
+    assert ((towards * normals).sum(axis=2) > 0).any(axis=0).all()
     record = read_cloud_record(run)
     assert record is not None and record.frames == 1 and record.points == len(points)
     assert record.reasons["matched"] == len(points) and not record.warnings
@@ -116,10 +120,12 @@ def test_a_frame_without_points_is_an_error_that_says_why(tmp_path: Path) -> Non
     assert not (run.path / "cloud" / "000000.ply").exists()
 
 
-def test_clouds_without_colours_have_no_features(tmp_path: Path) -> None:
+def test_clouds_without_colours_or_normals_say_so(tmp_path: Path) -> None:
     file = tmp_path / "cloud" / "000000.ply"
     file.parent.mkdir()
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(np.zeros((3, 3), np.float32)))
     o3d.t.io.write_point_cloud(str(file), cloud)
     with pytest.raises(GeometryError, match="no colours"):
         CloudFrames(Run(tmp_path), 1).features(0)
+    with pytest.raises(GeometryError, match="no normals"):
+        CloudFrames(Run(tmp_path), 1).normals(0)
