@@ -8,9 +8,10 @@ import open3d as o3d
 from geomocap.carving.carving_settings import CarvingSettings, ConsistencySettings, HullSettings
 from geomocap.carving.frames import carve_frame
 from geomocap.carving.hull import hull
+from geomocap.carving.occupancy import Occupancy
 from geomocap.carving.silhouette_views import PinholeViews
 from geomocap.carving.subject_bounds import subject_box
-from geomocap.carving.visibility import SurfaceVoxels, depth_buffers
+from geomocap.carving.visibility import SurfaceVoxels, depth_buffers, enclosing_normals, normals
 from geomocap.carving.voxel_grid import Grid
 from tests.benchmarks.table import Row, measure
 from tests.geomocap.carving_scenes import FIGURE, ring, silhouettes
@@ -44,6 +45,30 @@ def textured_images(views: PinholeViews) -> np.ndarray:
         phase = np.linalg.solve(P[:, :3], rays.T).T * 2 * np.pi / 0.15
         images[c][hit] = 128 + 90 * np.sin(phase + phase[:, [1, 2, 0]])
     return np.clip(images + rng.normal(0, 3, images.shape), 0, 255).astype(np.uint8)
+
+
+def outward_sides() -> Row:
+    """Which way a flying body's thin wings face, of whose 256³ grid the surface is known."""
+    x, y, z = np.mgrid[-1:1:256j, -1:1:256j, -0.5:0.5:128j]
+    wings = (np.abs(z - 0.3 * np.abs(x)) < 0.012) & (np.abs(y) < 0.3) & (np.abs(x) < 0.95)
+    occupancy = Occupancy.of_dense(wings | ((x / 0.2) ** 2 + (y / 0.6) ** 2 + (z / 0.15) ** 2 < 1))
+    surface = occupancy.surface_indices()
+    right = normals(occupancy, surface)
+
+    def with_open3d() -> np.ndarray:
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(surface.astype(float)))
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(15))
+        cloud.orient_normals_consistent_tangent_plane(15)
+        return np.asarray(cloud.normals)
+
+    wrong = [float(((n * right).sum(axis=1) < 0).mean()) for n in (enclosing_normals(surface), with_open3d())]
+    return Row(
+        f"outward normals of {len(surface):,} surface voxels, thin wings",
+        measure(lambda: enclosing_normals(surface), 5),
+        "Open3D estimate_normals + consistent tangent plane",
+        measure(with_open3d, 1, warm_up=False),
+        note=f"wrong side {wrong[0]:.3f}, Open3D {min(wrong[1], 1 - wrong[1]):.3f} (either side of all)",
+    )
 
 
 def benchmark() -> list[Row]:
@@ -95,4 +120,5 @@ def benchmark() -> list[Row]:
             note=f"{consistent.consistency.max_passes} passes at most",
         ),
         Row("box round the subject", measure(lambda: subject_box(views, HullSettings()), 9)),
+        outward_sides(),
     ]
