@@ -20,7 +20,9 @@ from geomocap.subject.window_motion import motion_of
 # fourteen sets of paths, of thirteen captures, the better was taken with any power from 0.15 to 0.48 in twelve, with
 # 0.5 in eleven, with 0 in nine; in one of the others neither was better. All had been looked at before it was set.
 _PATHS = 0.3
-_LONG_UNSEEN = 0.1  # of the frames
+# Of the frames. In 18 of 25 hard captures no body was hidden for more than 0.08, and mean errors of rotations were 2°
+# to 9°, once 17°; in the others one was for 0.17 to 0.57, and they were 13° to 60°. All were looked at first.
+_LONG_UNSEEN = 0.1
 
 
 def make_model(job: Job, geometry: Geometry, motion: Motion) -> SubjectModel | str:
