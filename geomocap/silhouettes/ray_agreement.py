@@ -12,6 +12,8 @@ Matusik, Buehler, Raskar, McMillan & Gortler, Image-based visual hulls, SIGGRAPH
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
@@ -65,14 +67,17 @@ def unexplained(views: PinholeViews, heeded: np.ndarray | None = None, blind: np
             unseen[others],
             centers[c],
             rays,
-            np.arange(max(away[c] - reach, 0.0), away[c] + reach, step) + step / 2,
+            np.tile([max(away[c] - reach, 0.0), away[c] + reach], (len(rays), 1)),
+            step,
+            1,
+            0,
         )
         result[c] = denied.mean()
     return result
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def denied_rays(P, masks, valid, unseen, origin, rays, depths):
+def denied_rays(P, masks, valid, unseen, origin, rays, spans, step, slack, least):
     """Tell which rays have no point that all cameras agree to, (N,) bool.
 
     Parameters
@@ -83,16 +88,23 @@ def denied_rays(P, masks, valid, unseen, origin, rays, depths):
         Whether a camera agrees to what is outside of its image.
     origin : (3,) float
     rays : (N, 3) float
-    depths : (D,) float
-        Where on the rays to ask.
+    spans : (N, 2) float
+        First and last distance on each ray at which to ask.
+    step : float
+        From there to the next; the first point is half of it behind the first distance.
+    slack : int
+        Pixels along and across by which a point may miss a silhouette.
+    least : int
+        Cameras within whose images a point must be.
     """
     C, H, W = masks.shape
     result = np.ones(rays.shape[0], np.bool_)
     for r in range(rays.shape[0]):
         first = 0
-        for t in depths:
+        for k in range(math.ceil((spans[r, 1] - spans[r, 0]) / step)):
+            t = spans[r, 0] + (k + 0.5) * step
             x, y, z = origin[0] + t * rays[r, 0], origin[1] + t * rays[r, 1], origin[2] + t * rays[r, 2]
-            agreed = True
+            agreed, within = True, 0
             for n in range(C):
                 c = (first + n) % C  # who denied the point before will deny this one
                 says = unseen[c]
@@ -102,14 +114,15 @@ def denied_rays(P, masks, valid, unseen, origin, rays, depths):
                     b = (P[c, 1, 0] * x + P[c, 1, 1] * y + P[c, 1, 2] * z + P[c, 1, 3]) / w
                     if 0 <= a < W and 0 <= b < H and valid[c, int(b), int(a)]:
                         says = False
-                        for j in range(max(int(b) - 1, 0), min(int(b) + 2, H)):
-                            for i in range(max(int(a) - 1, 0), min(int(a) + 2, W)):
+                        within += 1
+                        for j in range(max(int(b) - slack, 0), min(int(b) + slack + 1, H)):
+                            for i in range(max(int(a) - slack, 0), min(int(a) + slack + 1, W)):
                                 says |= masks[c, j, i] > 0
                 if not says:
                     agreed = False
                     first = c
                     break
-            if agreed:
+            if agreed and within >= least:
                 result[r] = False
                 break
     return result

@@ -161,14 +161,15 @@ def test_all_inverted_silhouettes_are_told():
     assert "inverted" in str(wrong)
 
 
-def denied_reference(P, masks, valid, unseen, origin, rays, depths):
+def denied_reference(P, masks, valid, unseen, origin, rays, spans, step, slack, least):
     """`denied_rays` in NumPy, all points of a ray at once."""
     H, W = masks.shape[1:]
-    grown = [cv2.dilate(m, np.ones((3, 3), np.uint8)) for m in masks]
+    grown = [cv2.dilate(m, np.ones((2 * slack + 1, 2 * slack + 1), np.uint8)) for m in masks]
     denied = []
-    for ray in rays:
+    for ray, (near, far) in zip(rays, spans, strict=True):
+        depths = np.arange(near, far, step) + step / 2
         points = np.column_stack([origin + depths[:, None] * ray, np.ones(len(depths))])
-        agreed = np.ones(len(depths), bool)
+        agreed, within = np.ones(len(depths), bool), np.zeros(len(depths), int)
         for c in range(len(P)):
             q = points @ P[c].T
             front = q[:, 2] > 0
@@ -177,11 +178,13 @@ def denied_reference(P, masks, valid, unseen, origin, rays, depths):
             i, j = np.where(inside, v, 0).astype(int), np.where(inside, u, 0).astype(int)
             inside &= valid[c][i, j] > 0
             agreed &= np.where(inside, grown[c][i, j] > 0, unseen[c])
-        denied.append(not agreed.any())
+            within += inside
+        denied.append(not (agreed & (within >= least)).any())
     return np.array(denied)
 
 
-def test_kernel_agrees_with_its_reference():
+@pytest.mark.parametrize(("slack", "least"), [(1, 0), (0, 0), (1, 2)])
+def test_kernel_agrees_with_its_reference(slack, least):
     rng = np.random.default_rng(5)
     rig = walk_rig(4)
     masks = np.array([cv2.resize(rng.random((9, 12)), (96, 72)) > 0.7 for _ in range(4)]).astype(np.uint8)
@@ -190,8 +193,8 @@ def test_kernel_agrees_with_its_reference():
     unseen = np.array([False, True, False, True])
     pixels = rng.uniform((0, 0), (96, 72), (60, 2))
     origin, rays = rig.rays(0, pixels)
-    depths = np.linspace(0.0, 6.0, 200)
-    given = rig.projections[1:], masks[1:], valid[1:], unseen[1:], np.array(origin), rays, depths
+    spans = np.column_stack([rng.uniform(0.0, 1.0, 60), rng.uniform(5.0, 6.0, 60)])
+    given = rig.projections[1:], masks[1:], valid[1:], unseen[1:], np.array(origin), rays, spans, 0.03, slack, least
     result = denied_rays(*given)
     assert 0 < result.sum() < len(result)
     np.testing.assert_array_equal(result, denied_reference(*given))

@@ -39,7 +39,7 @@ def silhouettes(rig, frame):
     return masks
 
 
-def check(rig, turns=TURNS, order=None, blind=None):
+def check(rig, turns=TURNS, order=None, blind=None, speck=None):
     undistortion = Undistortion.of(rig)
     order = list(range(len(rig))) if order is None else order
 
@@ -47,6 +47,8 @@ def check(rig, turns=TURNS, order=None, blind=None):
         masks = silhouettes(rig, frame)
         if blind is not None:
             masks[blind][:] = False
+        if speck is not None:
+            masks[speck][:12, :12] = True
         return undistortion.views([masks[c] for c in order])
 
     ball = surface_points(3000)
@@ -84,6 +86,12 @@ def test_a_camera_that_sees_nothing_has_no_say(rig):
     found = check(rig, blind=4)
     assert np.isnan(found.left_out[4]).all() and np.isnan(found.model[4]).all()
     assert np.isfinite(np.delete(found.left_out, 4, axis=0)).all()
+
+
+def test_what_one_camera_alone_sees_beside_the_subject_is_not_compared(rig):
+    clear, found = check(rig), check(rig, speck=2)
+    np.testing.assert_array_equal(found.model[2], clear.model[2])
+    np.testing.assert_array_equal(found.left_out[2], clear.left_out[2])
 
 
 def made_check(model=0.95, left_out=0.9, camera_low=None, residual=0.002):
