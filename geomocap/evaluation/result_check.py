@@ -7,7 +7,8 @@ Three questions, each asked of what the others did not use for their answer:
 - *Cameras.* Each camera in turn is left out; the visual hull of the others is drawn into it, ray by ray. Calibration,
   synchronization and silhouettes that fit together give nearly the silhouette; a camera that contradicts the others
   stands out. (The hull is always a little larger than the subject, the more so the fewer cameras there are.)
-  Pieces of a silhouette that no other camera confirms are nothing of the subject, and not compared.
+  A piece beside a silhouette's largest that the others don't confirm together, a cable or a reflection, isn't compared
+  with it; a camera that lacks a limb and so denies it to the others still stands out by itself. With the model it is.
 - *Paths.* How far tracked surface points stay from where their bodies carry them.
 """
 
@@ -22,6 +23,7 @@ import numpy as np
 from geomocap.carving.carving_settings import HullSettings
 from geomocap.carving.hull import heard
 from geomocap.carving.silhouette_views import PinholeViews, Undistortion
+from geomocap.carving.visibility import camera_centers
 from geomocap.files.capture import Capture
 from geomocap.files.corrected_cameras import as_seen
 from geomocap.files.results import read_diagnostics, read_silhouette, read_skeleton
@@ -140,8 +142,8 @@ def check_result(
     for column, frame in enumerate(frames):
         seen = outlines.views(frame)
         hulls = _hulls_of_others(seen, _placed(mesh, motion, frame))
-        seen = _confirmed(seen, hulls)
         model[:, column] = _drawn_overlaps(mesh, motion, seen, outlines.rig, frame)
+        seen = _confirmed(seen, hulls)
         for c, drawn in enumerate(hulls):
             if drawn is not None:
                 left_out[c, column] = _overlap(drawn, seen.masks[c][_sampled(seen)] > 0)
@@ -183,7 +185,7 @@ def _hulls_of_others(views: PinholeViews, subject: np.ndarray) -> list[np.ndarra
     low, high = subject.min(axis=0), subject.max(axis=0)
     margin = _AROUND * float((high - low).max())
     inverse = np.linalg.inv(views.projections[:, :, :3])
-    centers = -np.einsum("cij,cj->ci", inverse, views.projections[:, :, 3])
+    centers = camera_centers(views.projections)
     away = np.linalg.norm(centers - 0.5 * (low + high), axis=1)
     pixel = float((away / np.linalg.norm(views.projections[:, 0, :3], axis=1)).min())  # at the subject, metres
     y, x = np.mgrid[: views.masks.shape[1], : views.masks.shape[2]][(slice(None), *_sampled(views))] + 0.5
@@ -206,7 +208,7 @@ def _hulls_of_others(views: PinholeViews, subject: np.ndarray) -> list[np.ndarra
 
 
 def _confirmed(views: PinholeViews, hulls: Sequence[np.ndarray | None]) -> PinholeViews:
-    """Leave out small pieces of silhouettes that no other camera confirms: they aren't the subject."""
+    """Leave out what the hull of all other cameras doesn't meet, of each silhouette's pieces but the largest."""
     masks = views.masks.copy()
     for mask, drawn in zip(masks, hulls, strict=True):
         if drawn is not None:

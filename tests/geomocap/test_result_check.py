@@ -88,10 +88,10 @@ def test_a_camera_that_sees_nothing_has_no_say(rig):
     assert np.isfinite(np.delete(found.left_out, 4, axis=0)).all()
 
 
-def test_what_one_camera_alone_sees_beside_the_subject_is_not_compared(rig):
+def test_what_one_camera_alone_sees_beside_the_subject_is_not_compared_with_the_others(rig):
     clear, found = check(rig), check(rig, speck=2)
-    np.testing.assert_array_equal(found.model[2], clear.model[2])
-    np.testing.assert_array_equal(found.left_out[2], clear.left_out[2])
+    np.testing.assert_array_equal(found.left_out, clear.left_out)
+    assert (found.model[2] < clear.model[2]).all()  # the model is judged by silhouettes as they are
 
 
 def made_check(model=0.95, left_out=0.9, camera_low=None, residual=0.002):
