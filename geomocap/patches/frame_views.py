@@ -211,7 +211,7 @@ def _reduced(views: PinholeViews, images: np.ndarray, factor: int) -> tuple[Pinh
         part = slice(low[0] * factor, high[0] * factor), slice(low[1] * factor, high[1] * factor)
         inside = views.masks[c][part]
         fraction = cv2.resize(inside.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
-        colored = (images[c][part] * inside[:, :, None]).astype(np.float32)
+        colored = cv2.copyTo(images[c][part], inside).astype(np.float32)
         value = cv2.resize(colored, (columns, rows), interpolation=cv2.INTER_AREA)
         small[(c, *box)] = np.rint(value / np.maximum(fraction, 1 / factor**2)[:, :, None]).clip(0, 255)
         masks[(c, *box)] = fraction >= 0.5

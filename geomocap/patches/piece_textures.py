@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from geomocap.patches.surface_patches import Patches
@@ -47,13 +49,16 @@ def best_matches(alike: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return k, i, j
 
 
+@cache
 def _turning(radius: int, angle: float) -> np.ndarray:
     """Weights (n, M) of the M samples of a square for the n of its inner disc once the texture has turned."""
     s, t = (g.ravel() for g in np.meshgrid(*[np.arange(-radius, radius + 1)] * 2))
     disc = s**2 + t**2 <= radius**2
     x = np.cos(angle) * s[disc] + np.sin(angle) * t[disc]
     y = np.cos(angle) * t[disc] - np.sin(angle) * s[disc]
-    return np.maximum(1 - np.abs(x[:, None] - s), 0) * np.maximum(1 - np.abs(y[:, None] - t), 0)
+    weights: np.ndarray = np.maximum(1 - np.abs(x[:, None] - s), 0) * np.maximum(1 - np.abs(y[:, None] - t), 0)
+    weights.flags.writeable = False  # it is kept
+    return weights
 
 
 def _normalised(textures: np.ndarray) -> np.ndarray:

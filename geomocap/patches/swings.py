@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from geomocap.patches.frame_views import FrameViews
 from geomocap.patches.piece_search import free_places, motion_of_piece
 from geomocap.patches.surface_patches import PatchAlignment, Patches
+from geomocap.scheduling import map_here
 
 _LINK = 2.0  # spacings of the patches; lost ones nearer than that belong to the same piece
 _LEAST = 18  # patches of a piece
@@ -116,9 +117,9 @@ def find_pieces(
     pieces : tuple of LostPiece
         Pieces to look for in the next frame: if these are found now, no patch of theirs is lost there.
     """
-    placed, left = np.zeros(len(good), bool), []
+    placed = np.zeros(len(good), bool)
+    asked: list[tuple[LostPiece, np.ndarray]] = []
     order = np.argsort(identity)
-    places: Patches | None = None
     positions, frames = found.positions.copy(), found.frames.copy()
     for piece in pieces:
         rows = order[np.searchsorted(identity, piece.identity, sorter=order).clip(0, len(identity) - 1)]
@@ -128,14 +129,20 @@ def find_pieces(
         piece, rows = piece.select(lost), rows[lost]
         if piece.looks == 0 and view.may_be_subject(found.positions[rows]).mean() > 1 - _ASTRAY:
             continue
-        left.append(replace(piece, looks=piece.looks + 1))
-        if places is None:
-            places = free_places(found.positions[good], patches, view, spacing)
+        asked.append((piece, rows))
+    if not asked:
+        return found, placed, ()
+    places = free_places(found.positions[good], patches, view, spacing)
+
+    def motion_now(piece: LostPiece, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         own = patches.select(rows).moved(piece.positions, piece.frames)
-        motion = motion_of_piece(own, places, view, slack[rows], spacing)
+        return motion_of_piece(own, places, view, slack[rows], spacing)
+
+    for (piece, rows), motion in zip(asked, map_here(lambda this: motion_now(*this), asked), strict=True):
         if motion is not None:
             turn, shift = motion
             positions[rows] = piece.positions @ turn.T + shift
             frames[rows] = turn @ piece.frames
             placed[rows] = True
-    return found.at(positions, frames), placed, tuple(left)
+    left = tuple(replace(piece, looks=piece.looks + 1) for piece, _ in asked)
+    return found.at(positions, frames), placed, left
