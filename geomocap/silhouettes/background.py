@@ -12,7 +12,9 @@ from numba import njit, prange
 
 from geomocap.errors import CaptureError
 from geomocap.silhouettes.background_noise import noise
+from geomocap.silhouettes.enclosed_regions import enclosed
 from geomocap.silhouettes.light import light_change
+from geomocap.silhouettes.recurrence import ALIKE, WINDOW, recurrences
 from geomocap.silhouettes.silhouette_settings import SilhouetteSettings
 
 TEXTURE_WINDOW = 5  # pixels along its side
@@ -125,9 +127,10 @@ def model_from_plate(
 def model_from_frames(
     frames: Sequence[np.ndarray], settings: SilhouetteSettings | None = None, camera: str = ""
 ) -> BackgroundModel:
-    """Estimate the background over time: at each pixel the colour that the most frames agree on.
+    """Estimate the background over time: at each pixel the colour that comes back most often with its surroundings.
 
-    Where too few frames agree (the subject never leaves, and moves), the background is unknown.
+    Where too few frames agree (the subject never leaves, and moves), and where what doesn't change is enclosed by what
+    does (the subject's middle never leaves), the background is unknown.
 
     Parameters
     ----------
@@ -144,14 +147,22 @@ def model_from_frames(
     """
     settings = settings or SilhouetteSettings()
     mean, sigma, support = background_over_time(frames, settings, camera)
-    least = max(settings.support, 2.0 / len(frames))
-    return BackgroundModel(mean, sigma, support >= least, camera)
+    model = BackgroundModel(mean, sigma, support >= max(settings.support, 2.0 / len(frames)), camera)
+    changed = np.stack([_changed(image, model, settings) for image in frames])
+    return BackgroundModel(mean, sigma, model.known & ~enclosed(mean, changed), camera)
+
+
+def _changed(image: np.ndarray, model: BackgroundModel, settings: SilhouetteSettings) -> np.ndarray:
+    """Where an image differs from the background by more than 3 sigma in any channel, (H, W) uint8."""
+    gain, offset = (a.astype(np.float32) for a in _light(image, model, settings))
+    away = np.abs((image - offset) / gain - model.mean).max(axis=-1)
+    return (away > 3.0 * model.sigma).astype(np.uint8)
 
 
 def background_over_time(
     frames: Sequence[np.ndarray], settings: SilhouetteSettings, camera: str = ""
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find at each pixel the colour that the most frames agree on, and how many they are.
+    """Find at each pixel the colour that comes back with its surroundings in the most frames, and how many agree on it.
 
     Parameters
     ----------
@@ -188,7 +199,8 @@ def background_over_time(
     sigma = noise(frames, lights, model.mean, model.known)
     gains = np.array([g for g, _ in lights], np.float32)
     offsets = np.array([o for _, o in lights], np.float32)
-    mean, support = agreement(stack, gains, offsets, 3.0 * sigma, LIT)
+    windows = recurrences(stack, gains, offsets, 3.0 * sigma, WINDOW, ALIKE)
+    mean, support = agreement(stack, gains, offsets, 3.0 * sigma, windows, LIT)
     model = BackgroundModel(mean, sigma, known, camera)
     return mean, noise(frames, lights, model.mean, model.known), support
 
@@ -257,8 +269,8 @@ def add_agreeing(image, relit, plate, sigma, total, count):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def agreement(stack, gains, offsets, reach, lit):
-    """Find at each pixel the colour that the most frames agree on.
+def agreement(stack, gains, offsets, reach, windows, lit):
+    """Find at each pixel the colour that comes back with its surroundings in the most frames.
 
     Parameters
     ----------
@@ -267,15 +279,17 @@ def agreement(stack, gains, offsets, reach, lit):
         Light of each frame, frame = gain · background + offset.
     reach : (H, W) float32
         Colours within this distance in every channel agree, grey levels.
+    windows : (T, H, W) uint16
+        Frames in which the surroundings come back, see `recurrences`. Where that is alike, the most frames decide.
     lit : float
         Fraction of the frames from which a smaller group is preferred of which the largest one is a shadow.
 
     Returns
     -------
     mean : (H, W, 3) float32
-        Mean colour of the largest group (the first of equals), or of the one that it is a shadow of.
+        Mean of the colours that agree with it (the first of equals), or with the one that it is a shadow of.
     support : (H, W) float32
-        Fraction of the frames in it.
+        Fraction of the frames that agree.
     """
     n, h, w = stack.shape[0], stack.shape[1], stack.shape[2]
     mean = np.empty((h, w, 3), np.float32)
@@ -288,7 +302,7 @@ def agreement(stack, gains, offsets, reach, lit):
                 for c in range(3):
                     values[t, c] = (np.float32(stack[t, y, x, c]) - offsets[t, c]) / gains[t, c]
             limit = reach[y, x]
-            most, best = 0, 0
+            best = 0
             for t in range(n):
                 counts[t] = 0
                 for u in range(n):
@@ -298,8 +312,10 @@ def agreement(stack, gains, offsets, reach, lit):
                         and abs(values[u, 2] - values[t, 2]) <= limit
                     ):
                         counts[t] += 1
-                if counts[t] > most:
-                    most, best = counts[t], t
+            for t in range(1, n):
+                here, there = windows[t, y, x], windows[best, y, x]
+                if here > there or (here == there and counts[t] > counts[best]):
+                    best = t
             shaded = best
             for t in range(n):
                 if counts[t] >= max(2, lit * n) and (shaded == best or counts[t] > counts[best]):

@@ -12,7 +12,6 @@ from geomocap.errors import CaptureError, SettingsError
 from geomocap.silhouettes.background import (
     BackgroundModel,
     add_agreeing,
-    agreement,
     model_from_frames,
     model_from_plate,
 )
@@ -366,27 +365,3 @@ def test_shadow_misfit_is_that_of_the_shaded_background() -> None:
             limited = shadow_misfit(direct, image, lit, sigma, known, one, zero, 0.4, limit)
             np.testing.assert_array_equal(limited, np.where(result < limit, result, np.inf))
         assert np.isinf(result.ravel()[np.arange(25) != 12]).all()
-
-
-def test_agreement_is_the_largest_group() -> None:
-    rng = np.random.default_rng(4)
-    stack = rng.integers(0, 256, (7, 6, 5, 3)).astype(np.uint8)
-    stack[2:5] = stack[2] // 2 + rng.integers(0, 4, (3, 6, 5, 3)).astype(np.uint8)
-    gains, offsets = np.full((7, 3), 1.1, np.float32), np.full((7, 3), 2.0, np.float32)
-    reach = np.full((6, 5), 4.0, np.float32)
-    mean, support = agreement(stack, gains, offsets, reach, 2.0)
-    values = (stack - 2.0) / 1.1
-    close = (np.abs(values[:, None] - values[None]) <= 4).all(-1)  # (T, T, H, W)
-    best = close.sum(axis=1).argmax(axis=0)
-    group = np.take_along_axis(close, best[None, None], axis=0)[0]
-    np.testing.assert_allclose(support, group.mean(axis=0), atol=1e-6)
-    np.testing.assert_allclose(mean, (values * group[..., None]).sum(0) / group.sum(0)[..., None], atol=1e-3)
-
-
-def test_a_place_mostly_in_shadow_is_taken_as_it_looks_lit() -> None:
-    stack = np.full((10, 2, 2, 3), 120, np.uint8)
-    stack[:7, :, 0] = 72
-    light = np.ones((10, 3), np.float32), np.zeros((10, 3), np.float32)
-    mean, support = agreement(stack, *light, np.full((2, 2), 4.0, np.float32), 0.15)
-    np.testing.assert_allclose(mean, 120)
-    np.testing.assert_allclose(support, [[0.3, 1], [0.3, 1]])
