@@ -20,7 +20,7 @@ _OPENED = 2  # radius, pixels: thinner ways to the border are none
 
 
 def enclosed(mean: np.ndarray, changed: np.ndarray) -> np.ndarray:
-    """Find what changes less than all that is around it, which changes together, (H, W) bool.
+    """Find what changes less than all that is around it, (H, W) bool.
 
     What changes as little as that, and lies on no way to the border of the image that changes as little, is enclosed,
     for any fraction of the frames. So is what is between it and the background as far as it looks like it (watershed of
