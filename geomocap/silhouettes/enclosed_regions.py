@@ -12,11 +12,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-# Fractions of the frames. An outline that moves about its middle covers it in half of the frames or so; with up to 0.9,
-# what is seen between legs was enclosed, too, and in a real recording noise enclosed a quarter of the image.
+# Fractions of the frames. An outline that moves about its middle covers it in half of the frames or so. With up to 0.9
+# what is seen between legs is enclosed, too: a plain man's silhouettes overlapped with the true ones by 0.85 instead of
+# 0.92, and of a real mouse's first camera 7 % were unknown instead of 3.
 LEVELS = np.arange(6, 15) / 20
 _MEDIAN = 5  # pixels along its side; smaller changes are noise
-_OPENED = 2  # radius, pixels: thinner ways to the border are none
+_OPENED = 2  # radius, pixels: thinner ways to the border are none; settled by eye and overlap on six captures
 
 
 def enclosed(mean: np.ndarray, changed: np.ndarray) -> np.ndarray:
